@@ -24,6 +24,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from benchmarks.jitter_picture import jitter
 from benchmarks.timing import arguments, at_least, at_most, report
 from pipeline.base.config import (
     LimitsFile,
@@ -36,7 +37,6 @@ from pipeline.base.config import (
 from pipeline.compat.unified import no_normalization
 from pipeline.data.insertion import SENSOR, STATE
 from pipeline.look.page.style import write
-from pipeline.look.robot.pictures import jitter
 from pipeline.policy.checkpoint import PolicyCheckpoint, save_policy
 from pipeline.policy.observation import PolicyShape
 from pipeline.policy.policy import Policy

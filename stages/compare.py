@@ -29,7 +29,7 @@ from pipeline.evaluate.experiments import (
     read_experiments,
 )
 from pipeline.evaluate.figures import NO_INTERVAL
-from pipeline.look.evaluation.comparison import comparison_report
+from pipeline.look.comparison import comparison_report
 from pipeline.look.page.writing import write_report
 
 _TABLE = OutputKind("a table of experiments", begins_with("| experiment |"))

@@ -1,8 +1,9 @@
 """Look at this machine: what is there, what is missing, and what to install or set.
 
 Checks Python and packages, the GPU, torch's build and the attention backend, the checkpoint, the
-recordings and their videos, and the room for the store, for the params given. Downloads nothing,
-loads no model, changes nothing; takes some seconds. What DVC has and how it links: dvc doctor.
+recordings and their videos, for the params given. Downloads nothing, loads no model, changes
+nothing; takes some seconds. The room that the store needs: python -m stages.extract --set
+extract.plan=true. What DVC has and how it links: dvc doctor.
 
   python -m stages.doctor                                        as params.yaml stands
   python -m stages.doctor --set vlm.checkpoint=Qwen/Qwen2.5-VL-3B-Instruct --set data.root=/lab
@@ -25,14 +26,14 @@ from pipeline.base.commands import command
 from pipeline.base.config import Params
 from pipeline.base.errors import PipelineError
 from pipeline.base.issue import Issue
-from pipeline.look.doctor import described, examine
+from pipeline.look.doctor import describe, examine
 
 
 def main(params: Params) -> None:
     """Print every group of issues; refuse where something is missing."""
     lacking: list[Issue] = []
     for title, issues in examine(params):
-        print("\n".join(described(title, issues)), flush=True)
+        print("\n".join(describe(title, issues)), flush=True)
         lacking += [issue for issue in issues if issue.severity == "error"]
     if lacking:
         subjects = ", ".join(dict.fromkeys(issue.kind for issue in lacking))

@@ -22,7 +22,7 @@ from pipeline.base.durable import write_document
 from pipeline.base.ownership import REPORT, claim, refuse_foreign
 from pipeline.evaluate.evaluation import JUDGED, Evaluation, evaluate_checkpoint
 from pipeline.evaluate.tables import ablation_text, error_text, write_tables
-from pipeline.look.evaluation.page import evaluation_report
+from pipeline.look.evaluation import evaluation_report
 from pipeline.look.page.writing import PAGE, write_report
 from pipeline.policy.checkpoint import PolicyCheckpoint, find_policy, load_policy
 from pipeline.store import FeatureStore, check_trailers

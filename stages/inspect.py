@@ -13,8 +13,7 @@ is written, whatever it finds, and 2 where nothing could be looked at.
 
 The page of PATH goes into a folder of its own in reports/inspect, named after PATH; without PATH it
 goes into reports/inspect itself, and with --set inspect.output=FOLDER always into that one. Looking
-again replaces the page, its pictures and findings.csv there, and touches no other file. Digests of
-the checkpoint are remembered in reports/inspect/.files.sqlite, or where stages.extract does it.
+again replaces the page, its pictures and findings.csv there, and touches no other file.
 """
 
 from stages.command import Shorthand, run
@@ -37,8 +36,8 @@ from pipeline.look.page.issues import FINDINGS, group_issues, place_of, places_o
 from pipeline.look.page.style import boxes
 from pipeline.look.page.writing import write_report
 from pipeline.look.recording.page import recordings_report
-from pipeline.look.recording.subject import Subject, subject_of
-from pipeline.look.store.page import inspect_store, store_report
+from pipeline.look.store import inspect_store, store_report
+from pipeline.look.subject import Subject, subject_of
 
 SHOWN = 8
 """Findings that the terminal shows."""
@@ -60,7 +59,7 @@ def summary(report: Report) -> Iterator[str]:
     """What the page says first, for a terminal."""
     yield report.title
     yield " · ".join(f"{label} {value}" for label, value in report.tiles)
-    # The first are those of all: those of single parts come later.
+    # The first block of issues holds those of the whole page.
     issues = next(report.blocks(Issues))
     groups = group_issues(issues.issues)
     if not groups:

@@ -25,8 +25,8 @@ from pipeline.base.config import Params
 from pipeline.base.ownership import REPORT, claim, refuse_foreign, release
 from pipeline.evaluate.probe.study import probe
 from pipeline.evaluate.probe.tables import advice, table, write_tables
-from pipeline.look.evaluation.draw_probe import heat_map
 from pipeline.look.page.style import write
+from pipeline.look.probe import draw_gains
 from pipeline.store import FeatureStore, check_trailers
 
 
@@ -43,7 +43,7 @@ def main(params: Params) -> None:
     claim(wanted.output, REPORT)
     files = [
         *write_tables(wanted.output, study),
-        *write(wanted.output, {"probe.png": lambda: heat_map(study)}),
+        *write(wanted.output, {"probe.png": lambda: draw_gains(study)}),
     ]
     release(wanted.output, REPORT)
     print(table(study))

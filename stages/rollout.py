@@ -30,7 +30,7 @@ from pipeline.evaluate.rollouts import Rollouts, roll_out
 from pipeline.evaluate.served_rollouts import roll_out_served
 from pipeline.look.page.blocks import Report
 from pipeline.look.page.writing import write_report
-from pipeline.look.rollout.page import rollout_report
+from pipeline.look.rollout import rollout_report
 from pipeline.policy.checkpoint import find_policy, load_policy
 from pipeline.robot.client import TOKEN_VARIABLE, PolicyClient
 from pipeline.robot.features import LiveFeatures

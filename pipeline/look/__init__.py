@@ -1,4 +1,5 @@
-"""What is in a recording, a store, an evaluation, a machine, for people who would rather look.
+"""Pages for people who would rather look: recordings, a store, an evaluation, rollouts; doctor.
 
-One room a topic: facts, pictures and the sections of its page together; `page` writes them.
+A file a topic has its facts, pictures and sections together; recordings, which have most, are a
+folder of such files. `page` writes them.
 """

@@ -19,7 +19,7 @@ from pipeline.data.lerobot import action_kind
 from pipeline.data.lerobot_rows import read_clock
 from pipeline.data.timeline import build_timeline
 from pipeline.look.recording.episode import view_episode
-from pipeline.look.recording.overview import find_issues
+from pipeline.look.recording.page import find_issues
 
 VERSIONS = ["v2.0", "v2.1", "v3.0"]
 LENGTHS = (7, 5, 9)

@@ -13,8 +13,8 @@ from playwright.sync_api import Browser, Page, Route
 from pipeline.base.issue import Issue
 from pipeline.base.table import Table
 from pipeline.look.page.blocks import (
-    Document,
     Issues,
+    Outline,
     Picture,
     Report,
     Section,
@@ -215,7 +215,7 @@ def every_block() -> Report:
                             TokenRun("<|image_pad|>", "image", "48 tokens"),
                         ]
                     ),
-                    Document("Spec", {"weights": "w" * 300, "slots": [{"layer": -1}], "x": {}}),
+                    Outline("Spec", {"weights": "w" * 300, "slots": [{"layer": -1}], "x": {}}),
                 ],
             ),
         ],

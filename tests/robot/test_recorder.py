@@ -17,7 +17,7 @@ from pipeline.base.errors import RecordingError
 from pipeline.data import Recording, open_recordings
 from pipeline.data.insertion import SENSOR, STATE
 from pipeline.extract import extract
-from pipeline.look.recording.robot_run import compare_keys
+from pipeline.look.robot_run import compare_keys
 from pipeline.robot import recorder as recorder_module
 from pipeline.robot.recorder import RunRecorder, encode_png, recover
 from pipeline.simulation.environment import InsertionEnvironment

@@ -1,4 +1,4 @@
-"""Whether the recordings are there, and can be read."""
+"""Whether the recordings are there and can be read."""
 
 from collections import Counter
 from collections.abc import Iterator
@@ -16,7 +16,7 @@ _WHEEL = "pip install --upgrade --force-reinstall --only-binary av av"
 _VIDEOS = {".mp4", ".mkv", ".avi", ".mov", ".webm"}
 
 
-def check(params: Params) -> Iterator[Issue]:
+def check_recordings(params: Params) -> Iterator[Issue]:
     """`data.root` and each source; metadata is read, and one frame of a video."""
     data = params.data
     demo = f"{command('demo')} (or dvc repro)" if data.root == params.demo.recordings else ""
@@ -36,13 +36,17 @@ def check(params: Params) -> Iterator[Issue]:
 
 
 def check_source(source: Source, opened: Opened, on_bad: str) -> Iterator[Issue]:
-    """What a source holds, what of it cannot be read, and whether DVC sees it."""
+    """The episodes of a source, those that cannot be read, and whether its videos decode."""
     formats = Counter(recording.format for recording in opened.recordings)
     text = ", ".join(f"{count} episode(s), {name}" for name, count in formats.items())
     yield ok(source.name, text or "no episode")
     if opened.bad:
         first = f"{len(opened.bad)} episode(s) cannot be read, first: {opened.bad[0].reason}"
-        yield unusable(source.name, first, on_bad)
+        if on_bad == "skip":
+            yield note(source.name, first, "left out, as data.on_bad_episode says")
+        else:
+            remedy = "mend or remove them, or set data.on_bad_episode=skip"
+            yield missing(source.name, first, remedy)
     if opened.missing:
         text = f"{len(opened.missing)} listed episode(s) are not there: {opened.missing[0]}"
         yield note(source.name, text, "copy them too, or leave them out")
@@ -50,13 +54,6 @@ def check_source(source: Source, opened: Opened, on_bad: str) -> Iterator[Issue]
     videos = [file for episode in lerobot[:1] for file in episode.files() if file.suffix in _VIDEOS]
     if videos:
         yield check_video(source.name, videos[0], source.limits)
-
-
-def unusable(subject: str, message: str, on_bad: str) -> Issue:
-    """What is said of episodes that cannot be used: they are left out, or nothing runs."""
-    if on_bad == "skip":
-        return note(subject, message, "left out, as data.on_bad_episode says")
-    return missing(subject, message, "mend or remove them, or set data.on_bad_episode=skip")
 
 
 def check_video(source: str, path: Path, limits: MediaLimits = DEFAULT_LIMITS) -> Issue:

@@ -1,1 +1,1 @@
-"""What a page is made of, and how it is written: `blocks` by `writing`, from `templates/`."""
+"""The blocks of a page, and how `writing` makes HTML and PNG files of them by `templates/`."""

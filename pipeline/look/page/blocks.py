@@ -1,4 +1,4 @@
-"""What a page is made of, before it is HTML."""
+"""The blocks that a page is made of."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -16,7 +16,7 @@ class Text:
 
     words: str
     page: str = ""
-    """Another page of this project, relative to this one, that a link behind the words opens."""
+    """A page to link to behind the words, relative to this one."""
 
 
 @dataclass(frozen=True)
@@ -26,16 +26,15 @@ class Picture:
     name: str
     """File stem, once in a report."""
     caption: str
-    """What is seen and how to read it; also what a screen reader says."""
+    """What it shows and how to read it; also for screen readers."""
     draw: Callable[[], Figure]
 
 
 @dataclass(frozen=True)
 class Issues:
-    """What looks wrong, of which times are seconds as the page counts them.
+    """What looks wrong; times are seconds as the page counts them.
 
-    The page shows the same issue at several places once (`group_issues`), and says `none` where
-    there is no issue.
+    The page shows the same issue at several places once (`group_issues`), and `none` without any.
     """
 
     issues: Sequence[Issue]
@@ -59,14 +58,14 @@ class Tokens:
 
 
 @dataclass(frozen=True)
-class Document:
-    """A nested document (feature spec, params), folded, as indented YAML-like lines."""
+class Outline:
+    """A nested mapping (feature spec, params) as indented lines, folded."""
 
     title: str
     content: Mapping[str, Any]
 
 
-Block = Text | Table | Picture | Issues | Tokens | Document
+Block = Text | Table | Picture | Issues | Tokens | Outline
 
 
 @dataclass(frozen=True)
@@ -83,7 +82,7 @@ BlockKind = TypeVar("BlockKind", bound=Block)
 
 @dataclass(frozen=True)
 class Report:
-    """A page: what it is of in one line, the figures that matter most, and its sections."""
+    """A page: a summary in one line, the figures that matter most, and its sections."""
 
     title: str
     summary: str

@@ -1,4 +1,4 @@
-"""What looks wrong, as a page, a terminal and `findings.csv` tell it: once, with all its places."""
+"""Issues in groups, as a page, a terminal and `findings.csv` show them."""
 
 from collections import defaultdict
 from collections.abc import Sequence
@@ -13,20 +13,20 @@ FINDINGS = "findings.csv"
 def group_issues(issues: Sequence[Issue]) -> list[list[Issue]]:
     """Issues of one severity, kind and stream together: errors first, then what shows most often.
 
-    The message of the first stands for all of its group. `episode` becomes what a reader calls the
-    place: it names the source where there are several.
+    The message of the first stands for its group. `episode` becomes the name of the place: with its
+    source, where there are several.
     """
     several = len({issue.source for issue in issues}) > 1
     groups: dict[tuple[Severity, str, str], list[Issue]] = defaultdict(list)
     for issue in issues:
-        named = f"{issue.source}/{issue.episode}" if several and issue.episode else issue.episode
+        name = f"{issue.source}/{issue.episode}" if several and issue.episode else issue.episode
         key = issue.severity, issue.kind, issue.stream
-        groups[key].append(replace(issue, episode=named or issue.source))
+        groups[key].append(replace(issue, episode=name or issue.source))
     return sorted(groups.values(), key=lambda group: (group[0].severity != "error", -len(group)))
 
 
 def places_of(group: Sequence[Issue]) -> str:
-    """The stream; then, of one issue, its episode and time, of several, how many there are."""
+    """The stream; then the episode and time of a single issue, or the number of several."""
     places, episodes = len(group), len({(issue.source, issue.episode) for issue in group})
     words = "1 episode" if episodes == 1 else f"{episodes:,} episodes"
     if places > episodes:
@@ -46,7 +46,7 @@ def place_of(issue: Issue) -> str:
 
 
 def findings_csv(issues: Sequence[Issue]) -> str:
-    """A line an issue for programs, in the order of the page; times are seconds as it counts."""
+    """A line an issue for programs, in the order and with the times of the page."""
     heads = ("severity", "kind", "stream", "episode", "start_s", "stop_s", "message")
     rows: list[tuple[str, ...]] = []
     for issue in (issue for group in group_issues(issues) for issue in group):

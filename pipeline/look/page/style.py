@@ -1,8 +1,8 @@
-"""What every picture shares: colours, fonts, and how it becomes a file.
+"""What all pictures share: colours, fonts, and how they become files.
 
-The same numbers give the same bytes. Every way of acting keeps its colour, marker and line in all
-pictures (Okabe and Ito's palette, which colour-blind readers can tell apart). What is neutral is
-drawn in `INK` or `GRID` alone: a page exchanges them for its own colours, in light and in dark.
+The same numbers give the same bytes. Colours are of Okabe and Ito's palette, which colour-blind
+readers can tell apart. Neutral shapes are drawn in `INK` or `GRID` alone: a page exchanges these
+for its own colours, in light and in dark.
 """
 
 import re
@@ -26,17 +26,17 @@ from numpy.typing import NDArray
 from pipeline.base.durable import disk_full_named, fresh
 
 INK = "#333333"
-"""Text, axes, and whatever else is black on white paper."""
+"""Text, axes, and everything else that is black on white paper."""
 GRID = "#dddddd"
 """Grid lines, and areas behind data."""
 PALETTE = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00")
-"""Of what has no colour of its own; Okabe and Ito's, less what is lost on white or on black."""
+"""Okabe and Ito's colours without those that are lost on white or on black."""
 _CJK = (
     *("Noto Sans CJK KR", "Noto Sans CJK JP", "Noto Sans CJK SC"),
     *("NanumGothic", "Malgun Gothic", "Microsoft YaHei", "Yu Gothic"),
     *("Apple SD Gothic Neo", "Hiragino Sans", "PingFang SC"),
 )
-"""Fonts of Debian, Windows and macOS with what Chinese, Japanese and Korean names are made of."""
+"""Fonts of Debian, Windows and macOS with Chinese, Japanese and Korean letters."""
 NO_FONT = (
     "PNG files show boxes for letters that no font of this machine has. Install one that has them, "
     "as fonts-noto-cjk of Debian and Ubuntu has Chinese, Japanese and Korean."
@@ -45,7 +45,7 @@ _NO_GLYPH = re.compile(rf"Glyph \d+ |{re.escape(NO_FONT)}")
 
 
 def families() -> list[str]:
-    """Where letters are looked for, one font after the other; only what this machine has."""
+    """The fonts of this machine in which letters are looked up, in this order."""
     if not set(_CJK) & set(font_manager.get_font_names()):
         # Matplotlib remembers its list, which may be older than a font.
         listed = {font.fname for font in font_manager.fontManager.ttflist}
@@ -62,9 +62,9 @@ RC: dict[Any, Any] = {
     **dict.fromkeys(("xtick.color", "ytick.color", "hatch.color"), INK),
     # A name from a recording is no TeX, whatever dollars it has.
     "text.parse_math": False,
-    # Else the ids inside an SVG are drawn by chance.
+    # Without it the ids inside an SVG are random.
     "svg.hashsalt": "pipeline",
-    # Matplotlib warns of each that is absent.
+    # Only fonts that exist: matplotlib warns of every other.
     "font.family": families(),
     "axes.titlesize": 11,
     "axes.spines.top": False,
@@ -94,7 +94,7 @@ def write(folder: Path, pictures: Mapping[str, Callable[[], Figure]]) -> list[Pa
 
 @contextmanager
 def boxes() -> Generator[set[str]]:
-    """A set that holds `NO_FONT` once a letter was drawn as a box; no letter warns of itself."""
+    """A set that gets `NO_FONT` once a letter was drawn as a box; replaces a warning a letter."""
     notes: set[str] = set()
     show = warnings.showwarning
 
@@ -111,7 +111,7 @@ def boxes() -> Generator[set[str]]:
 
 
 def canvas(width: float, height: float) -> Figure:
-    """An empty picture of this size in inches, without a window."""
+    """An empty picture of this size in inches."""
     return Figure(figsize=(width, height))
 
 
@@ -136,7 +136,7 @@ def draw_map(
     colours: str | Colormap = "viridis",
     numbered: bool = True,
 ) -> AxesImage:
-    """The (row, column) values as coloured cells, numbered in an ink that shows; NaN is empty."""
+    """The (row, column) values as coloured cells with their numbers; NaN is empty."""
     low, high = limits
     axis.grid(visible=False)
     image = axis.imshow(grid, colours, vmin=low, vmax=high, aspect="auto", interpolation="nearest")
@@ -152,7 +152,7 @@ def draw_map(
 
 
 def shorten_middle(name: str, begin: int, end: int) -> str:
-    """A name with an ellipsis for its middle, where it is longer than both ends."""
+    """A name without its middle, where it is longer than both ends."""
     return name if len(name) <= begin + end + 1 else f"{name[:begin]}…{name[-end:]}"
 
 
@@ -162,7 +162,7 @@ def draw_strip(
     frames: Mapping[str, Sequence[NDArray[np.uint8]]],
     times_s: Sequence[float],
 ) -> None:
-    """The frames of each view as a row of `grid`, from the first, below the times they are of."""
+    """The frames of each view as a row of `grid`, from the first, below their times."""
     for row, (view, images) in enumerate(frames.items()):
         for column, image in enumerate(images):
             axis = figure.add_subplot(grid[row, column])
@@ -174,7 +174,7 @@ def draw_strip(
 
 
 def logarithmic(axis: Axes) -> None:
-    """Powers of ten upwards, said in plain numbers: matplotlib's own are TeX."""
+    """Powers of ten upwards, in plain numbers: matplotlib's own labels are TeX."""
     axis.set_yscale("log")
     axis.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
     axis.yaxis.set_minor_formatter(NullFormatter())

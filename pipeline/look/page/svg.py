@@ -12,23 +12,23 @@ from PIL import Image
 from pipeline.look.page.style import GRID, INK, PALETTE
 
 RASTER_DPI = 144
-"""Of what is drawn as points of an image inside the SVG."""
+"""Resolution of bitmaps inside the SVG."""
 POINTS_INCH, POINT_PX = 72, 96 / 72
 PHOTO_BYTES, PHOTO_RATIO, PHOTO_QUALITY = 2**15, 3, 88
 """An image of at least so many bytes that JPEG makes so many times smaller is a photograph."""
 _NONE = dict.fromkeys(("Date", "Creator", "Format", "Type"))
-"""What matplotlib says of itself in a file."""
+"""Metadata that matplotlib writes into a file."""
 FONTS = "system-ui, -apple-system, 'Segoe UI', Roboto, 'Noto Sans', sans-serif"
 COLOURS = {INK: "ink", "#000000": "ink", GRID: "grid", PALETTE[0]: "blue"}
-"""Colours of a picture that follow the page's light or dark, by their names in its style."""
+"""Colours of a picture that follow the page's light or dark -> their names in its style."""
 
 
 def inline_svg(figure: Figure, name: str, label: str) -> str:
     """One `<svg>` element of `figure`; the same figure gives the same bytes.
 
-    Text stays text in the page's font. Neutral colours become the page's, the background nothing,
-    images data URIs (photographs as JPEG). Every id begins with `name`, so that several pictures
-    stand in one page. `label` is what a screen reader says.
+    Text stays text in the page's font, neutral colours become the page's, the background is
+    transparent, and images are data URIs (photographs as JPEG). Every id begins with `name`, so
+    that one page can hold several pictures. `label` is for screen readers.
     """
     written = io.StringIO()
     # Matplotlib makes ids of clips and markers from their content and this salt.
@@ -36,7 +36,7 @@ def inline_svg(figure: Figure, name: str, label: str) -> str:
         figure.savefig(written, format="svg", dpi=RASTER_DPI, transparent=True, metadata=_NONE)
     body = re.sub(r"^.*?<svg[^>]*>|</svg>\s*$", "", written.getvalue(), flags=re.DOTALL)
     width, height = POINTS_INCH * figure.get_size_inches()
-    # No wider than it was drawn. What has no colour of its own is black in SVG: the ink, too.
+    # No wider than it was drawn. Shapes without a colour, black in SVG, take the page's ink.
     return (
         f'<svg viewBox="0 0 {width:g} {height:g}" xmlns:xlink="http://www.w3.org/1999/xlink" '
         f'fill="currentColor" style="--w:{width * POINT_PX:.0f};--h:{height * POINT_PX:.0f}" '

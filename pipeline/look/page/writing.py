@@ -26,11 +26,11 @@ from pipeline.look.page.svg import inline_svg
 
 PAGE = "report.html"
 OPEN_GROUPS = 12
-"""Groups of issues that show at once; the rest unfold."""
+"""Groups of issues that are shown at once; the others unfold."""
 NAMED_PLACES = 3
-"""Of a group, those that show at once; all of them unfold."""
+"""Issues of a group that are shown at once; all of them unfold."""
 MOST_PLACES = 300
-"""Of a group, those that the page lists; more stand in `findings.csv` only."""
+"""Issues of a group in the page; `findings.csv` has all."""
 _WRITTEN = re.compile(r'<meta name="pictures" content="([^"]*)">')
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*")
 _TEMPORARY = OutputKind("a page in the making", Path.is_dir)
@@ -39,12 +39,11 @@ _TEMPORARY = OutputKind("a page in the making", Path.is_dir)
 def write_report(folder: Path, report: Report) -> list[Path]:
     """Write `report.html` and `<name>.png` of every picture into `folder`; return their paths.
 
-    A page that says what looks wrong has all of it in `findings.csv` beside it. Pictures are drawn
-    one at a time. Each file is put in place whole, the page last, so that a kill leaves the old
-    page. Pictures that the page of before had and this one has not are removed; of other files in
-    `folder` none is touched: whose that is, the caller has asked. Raises `DiskFull` with the old
-    page in place, and `ValueError` for a picture's name that is twice in the report or no plain
-    file stem.
+    A page with issues has all of them in `findings.csv` beside it. Pictures are drawn one at a
+    time. Each file is put in place whole, the page last, so that a kill leaves the old page.
+    Pictures of the old page that this one lacks are removed; no other file in `folder` is touched.
+    The caller has checked that the folder may be written to. Raises `DiskFull` with the old page in
+    place, and `ValueError` for a picture's name that is twice in the report or no plain file stem.
     """
     names = [picture.name for picture in report.blocks(Picture)]
     if len(set(names)) < len(names) or not all(map(_NAME.fullmatch, names)):
@@ -55,11 +54,11 @@ def write_report(folder: Path, report: Report) -> list[Path]:
         try:
             begin_folder(temporary, _TEMPORARY)
             texts = {PAGE: _PageWriter(temporary).html(report, names)}
-            # The first issues are those of all; those of single parts come later.
+            # The first block of issues holds those of the whole page.
             if issues := next(report.blocks(Issues), None):
                 texts = {FINDINGS: findings_csv(issues.issues), **texts}
             for name, text in texts.items():
-                # A file's name need not be text: what is none is shown as \udcXX.
+                # A file's name need not be text: other bytes are shown as \udcXX.
                 (temporary / name).write_text(text, encoding="utf-8", errors="backslashreplace")
             return _put_in_place(temporary, folder, [*(f"{name}.png" for name in names), *texts])
         finally:
@@ -82,7 +81,7 @@ def _put_in_place(temporary: Path, folder: Path, files: Sequence[str]) -> list[P
 
 
 class _PageWriter:
-    """One page in the making: where its pictures go, and which anchors are taken."""
+    """Renders one page and writes its pictures into a folder."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
@@ -102,7 +101,7 @@ class _PageWriter:
         self._blocks: Any = self._jinja.get_template("blocks.html", globals=shown).module
 
     def html(self, report: Report, pictures: Sequence[str]) -> str:
-        """The whole page; its pictures are written on the way."""
+        """The whole page, after its pictures were written."""
         bar = tqdm(total=len(pictures), desc="pictures", unit="", disable=None)
         with bar as self._bar, boxes() as notes:
             sections = [self._section(section) for section in report.sections]
@@ -127,11 +126,11 @@ class _PageWriter:
         return stem if count == 1 else f"{stem}-{count}"
 
     def _block(self, block: Block) -> Markup:
-        """By the macro of `blocks.html` that is called like its class."""
+        """The block, by the macro of `blocks.html` with the name of its class."""
         return getattr(self._blocks, type(block).__name__.lower())(block)
 
     def _draw(self, picture: Picture) -> Markup:
-        """The picture as SVG; its PNG is written on the way, from the same figure."""
+        """The picture as SVG; the same figure is written as PNG."""
         with mpl.rc_context(RC):
             figure = picture.draw()
             write(self._folder, {f"{picture.name}.png": lambda: figure})
@@ -141,15 +140,15 @@ class _PageWriter:
 
 
 def sentence(words: str) -> str:
-    """Words of a table or a terminal with a capital and a full stop, to stand in a text."""
+    """Words of a table or a terminal as a sentence, with a capital and a full stop."""
     return f"{words[0].upper()}{words[1:]}."
 
 
 def prose(words: str) -> Markup:
-    """Plain words with what stands in backticks as code."""
+    """Plain words; words in backticks are code."""
     return Markup(re.sub(r"`([^`]+)`", r"<code>\1</code>", str(escape(words))))
 
 
 def breakable(words: str) -> Markup:
-    """Words, a path or an id, that may go on in a new line after a `/` or `_` inside it."""
+    """Words, a path or an id, that may break after a `/` or `_` inside."""
     return Markup(re.sub(r"(?<=\w)([/_])", r"\1<wbr>", str(escape(words))))

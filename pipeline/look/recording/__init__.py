@@ -1,1 +1,1 @@
-"""Recordings: what they hold, what looks wrong, and their page."""
+"""Recordings: a file a topic with its facts, what looks wrong in it, its picture and section."""

@@ -1,13 +1,13 @@
-"""When everything was sampled: rates, jitter and gaps, what looks wrong in them, and their lanes.
+"""When each stream was sampled: rates, jitter and gaps, what looks wrong in them, and their lanes.
 
-A step is a gap from `GAP_FACTOR` usual steps: one entry lost from a jittering clock (two steps and
-the jitter) is none, two lost in a row are.
+A step is a gap from `GAP_FACTOR` usual steps on: one entry lost from a jittering clock (two steps
+and the jitter) is no gap, two lost in a row are.
 """
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -17,9 +17,7 @@ from numpy.typing import NDArray
 
 from pipeline.base.config import Params
 from pipeline.base.issue import Issue
-from pipeline.base.source import RATE_TOLERANCE
 from pipeline.base.table import Table
-from pipeline.data.recording import Nominal
 from pipeline.data.timeline import Timeline
 from pipeline.look.page.blocks import Block
 from pipeline.look.page.style import GRID, INK, PALETTE, panels
@@ -29,16 +27,12 @@ from pipeline.look.recording.episode import Draw, EpisodeView
 GAP_FACTOR = 2.5
 # Usual steps from which a camera's step has lost a frame.
 DROPPED_STEP = 1.5
-# How many such steps there are at least, and what share of the steps they have to exceed, as have
-# the frames that there was time for: jitter alone leaves no time, as steps get shorter too.
+# Least number of such steps, and the share of all steps that they exceed, as do the frames that
+# there was time for: jitter alone leaves no time, as steps get shorter too.
 DROPPED, DROPPED_SHARE = 5, 0.05
-# By how much a stream may begin after the others, or end before them: in seconds, or as a share of
-# a short episode, there by so many ticks and `DROPPED_STEP` of its own steps in any case.
+# How late a stream may begin, or how early end: the smaller of seconds and a share of the episode,
+# but at least so many ticks and `DROPPED_STEP` of its own steps.
 LOST_S, LOST_SHARE, LOST_TICKS = 0.5, 0.05, 2.5
-# Share of entries that may have the time of the entry before.
-REPEATED = 0.05
-# Times the span that a VL row serves which its frames may usually be old.
-OLD = 2.0
 
 # Share of the mean step under which a median step means stamps in bursts.
 _BURSTS = 0.5
@@ -46,12 +40,22 @@ _BURSTS = 0.5
 _LONGEST = 0.02
 # Seconds between the ticks of an episode without two.
 _TICK_S = 0.1
-# Steps below which nothing is said of how a clock runs.
+# Steps from which frames can be called dropped.
 _FEWEST = 20
+
+_GAP_COLOUR = "#D55E00"
+# Colour of a stroke, in the order of the lanes: what feeds a lane stands above it.
+_KINDS = {"stream": PALETTE[4], "camera": PALETTE[0], "vl_row": PALETTE[2], "tick": INK}
+# Strokes that a lane has room for: of nearer entries, only one is drawn.
+_STROKES = 1500
+# VL rows of the lower picture, and its seconds without any.
+_ROWS_NEAR, _NEAR_S = 5, 1.5
+# How far the marks of a lane reach up and down.
+_HALF = 0.36
 
 
 class Span(NamedTuple):
-    """Where a clock skipped: from the last entry before to the first after, in seconds."""
+    """From one entry of a clock to a later one, in seconds."""
 
     start_s: float
     stop_s: float
@@ -79,17 +83,22 @@ class Clock:
         return _usual(self.time)[0]
 
     @cached_property
-    def shortest_gap_s(self) -> float:
-        """From how long on a step is a gap: `GAP_FACTOR` times the longest step that is usual.
+    def longest_step_s(self) -> float:
+        """The longest step; 0 for fewer than two entries."""
+        return float(np.diff(self.time).max(initial=0))
 
-        Infinite for fewer than three entries, and where times only repeat: no step is usual there.
+    @cached_property
+    def shortest_gap_s(self) -> float:
+        """`GAP_FACTOR` times the longest usual step.
+
+        Infinite for fewer than three entries, and where times only repeat.
         """
         longest = _usual(self.time)[1]
         return GAP_FACTOR * longest if len(self.time) > 2 and longest > 0 else float("inf")
 
     @cached_property
     def gaps(self) -> tuple[Span, ...]:
-        """Where it skips, in order."""
+        """Where it skips, in order: from the last entry before to the first after."""
         places = np.flatnonzero(np.diff(self.time) >= self.shortest_gap_s)
         return tuple(Span(float(self.time[at]), float(self.time[at + 1])) for at in places)
 
@@ -100,13 +109,13 @@ class Clock:
 
     @property
     def mean_rate_hz(self) -> float:
-        """Steps a second from the first entry to the last, gaps and all; NaN where none rises."""
+        """Steps a second from the first entry to the last, gaps included; NaN where none rises."""
         span = float(np.ptp(self.time)) if len(self.time) else 0.0
         return (len(self.time) - 1) / span if span > 0 else float("nan")
 
     @property
     def jitter_s(self) -> float:
-        """Standard deviation of the steps that are no gaps; NaN for fewer than three entries."""
+        """Standard deviation of the steps without gaps; NaN for fewer than three entries."""
         small = np.diff(self.time)
         small = small[small < self.shortest_gap_s]
         return float(small.std()) if len(small) > 1 else float("nan")
@@ -124,48 +133,17 @@ def read_clocks(view: EpisodeView) -> list[Clock]:
     return clocks
 
 
-def merge_equal(clocks: Iterable[Clock]) -> list[Clock]:
-    """The clocks, those with the very same times as one whose name lists theirs.
-
-    So a gap in the rows of a LeRobot episode is one gap and not one of each view and stream.
-    """
-    alike: dict[bytes, list[Clock]] = {}
-    for clock in clocks:
-        alike.setdefault(clock.time.tobytes(), []).append(clock)
-    return [replace(same[0], name=", ".join(c.name for c in same)) for same in alike.values()]
-
-
 def usual_step(time: NDArray[np.float64]) -> float:
     """The step of a clock in seconds, NaN for fewer than two entries.
 
-    The median; where entries are stamped in bursts, which have steps of nothing and long ones, the
+    The median; where entries are stamped in bursts, which have steps of zero and long ones, the
     mean without the longest 2 % of the rising steps, which may be gaps; 0 where times only repeat.
     """
     return _usual(time)[0]
 
 
-def find_clock_issues(view: EpisodeView, nominal: Nominal) -> Iterator[Issue]:
-    """Issues of kind gap, clock jump, repeated times, rate, dropped frames, lost ticks and old
-    frames; `nominal` is what the recording says of itself.
-
-    A gap shorter than the ticks are apart is none: no tick sees less by it.
-    """
-    recorded = [clock for clock in read_clocks(view) if clock.kind in ("camera", "stream")]
-    for clock in merge_equal(recorded):
-        expected = [nominal.rates_hz[n] for n in clock.name.split(", ") if n in nominal.rates_hz]
-        yield from _gaps(view, clock, _find_jumps(clock, recorded))
-        yield from _repeated(view, clock)
-        if clock.kind == "camera":
-            yield from _dropped(view, clock)
-        if expected and len(clock.time) > 2:
-            yield from _rate(view, clock, expected[0], nominal.where)
-    if len(recorded) > 1:
-        yield from _lost_ticks(view, recorded)
-    yield from _old_frames(view)
-
-
 def _usual(time: NDArray[np.float64]) -> tuple[float, float]:
-    """The usual step, and the longest that is usual."""
+    """The usual step, and the longest usual one."""
     steps = np.diff(time)
     if not len(steps):
         return float("nan"), float("nan")
@@ -178,54 +156,61 @@ def _usual(time: NDArray[np.float64]) -> tuple[float, float]:
     return (mean, float(kept[-1])) if median < _BURSTS * mean else (median, median)
 
 
-def _gaps(view: EpisodeView, clock: Clock, jumps: Mapping[Span, str]) -> Iterator[Issue]:
-    line, camera = view.timeline, clock.name.split(", ")[0].removeprefix("view ")
-    for gap in clock.gaps:
-        if gap.length_s <= _tick_s(view):
-            continue
-        kind, step = "gap", clock.step_s
-        message = f"no entry for {gap.length_s:.2f} s, expected one every {step:.3g} s"
-        if gap in jumps:
-            kind, since = "clock jump", f"{gap.start_s - view.zero:.2f} s"
-            message = f"the clock jumps by {gap.length_s - step:.2f} s at {since}: {jumps[gap]}"
-        if line is not None and camera in view.cameras:
-            newest = line.frame_time[camera][line.vl_row]
-            ages = (line.time - newest)[newest == gap.start_s]
-            if len(ages):
-                message += f"; ticks see a frame up to {ages.max():.2f} s old"
-        yield view.issue(kind, clock.name, message, *gap)
+def _merge_equal(clocks: Iterable[Clock]) -> list[Clock]:
+    """The clocks; those with the very same times become one whose name lists theirs.
 
-
-def _find_jumps(clock: Clock, recorded: Sequence[Clock]) -> dict[Span, str]:
-    """Where a clock was set, the longest jump first, rather than lacks entries; and what shows it.
-
-    A clock that was set ends apart from those without such a step, and near them less the step; one
-    that lacks entries ends with them.
+    So a gap in the rows of a LeRobot episode is one gap, not one of each view and stream.
     """
-    jumps: dict[Span, str] = {}
+    alike: dict[bytes, list[Clock]] = {}
+    for clock in clocks:
+        alike.setdefault(clock.time.tobytes(), []).append(clock)
+    return [replace(same[0], name=", ".join(c.name for c in same)) for same in alike.values()]
+
+
+def find_clock_issues(view: EpisodeView) -> Iterator[Issue]:
+    """Issues of kind gap, clock jump, dropped frames and lost ticks.
+
+    A gap shorter than a tick is no issue: no tick loses a reading by it.
+    """
+    recorded = [clock for clock in read_clocks(view) if clock.kind in ("camera", "stream")]
+    for clock in _merge_equal(recorded):
+        for gap in clock.gaps:
+            if gap.length_s > _tick_s(view):
+                kind, message = _describe_gap(view, clock, gap, recorded)
+                yield view.issue(kind, clock.name, message, *gap)
+        if clock.kind == "camera":
+            yield from _dropped(view, clock)
+    yield from _lost_ticks(view, recorded)
+
+
+def _describe_gap(
+    view: EpisodeView, clock: Clock, gap: Span, recorded: Sequence[Clock]
+) -> tuple[str, str]:
+    """Kind and message: entries are missing, or the clock was set."""
+    if apart := _ends_apart(clock, gap, recorded):
+        moved, at = gap.length_s - clock.step_s, gap.start_s - view.zero
+        words = f"the clock jumps by {moved:.2f} s at {at:.2f} s: it ends {apart[0]:.2f} s from "
+        return "clock jump", f"{words}the nearest other clock, {apart[1]:.2f} s without"
+    return "gap", f"no entry for {gap.length_s:.2f} s, expected one every {clock.step_s:.3g} s"
+
+
+def _ends_apart(clock: Clock, gap: Span, recorded: Sequence[Clock]) -> tuple[float, float] | None:
+    """Seconds from its end to the nearest clock without such a gap, and the same less the gap.
+
+    None where entries are missing: such a clock ends with the others, a clock that was set does not
+    end with them, and would without the jump.
+    """
+    ends = [c.time[-1] for c in recorded if c.longest_step_s < gap.length_s / 2]
+    if not ends:
+        return None
     end = float(clock.time[-1])
-    for gap in sorted(clock.gaps, key=lambda gap: -gap.length_s):
-        moved, half = gap.length_s - clock.step_s, gap.length_s / 2
-        ends = np.array([c.time[-1] for c in recorded if np.diff(c.time).max(initial=0) < half])
-        apart, left = (np.abs(at - ends).min(initial=np.inf) for at in (end, end - moved))
-        if LOST_S <= apart < np.inf and left < apart / 2:
-            jumps[gap] = f"it ends {apart:.2f} s from the nearest other clock, {left:.2f} s without"
-            end -= moved
-    return jumps
-
-
-def _repeated(view: EpisodeView, clock: Clock) -> Iterator[Issue]:
-    still = int(np.count_nonzero(np.diff(clock.time) == 0))
-    if still > REPEATED * (len(clock.time) - 1):
-        message = f"{still} of {len(clock.time)} entries have the time of the entry before"
-        yield view.issue("repeated times", clock.name, message)
+    moved = gap.length_s - clock.step_s
+    apart, left = (float(np.abs(at - np.array(ends)).min()) for at in (end, end - moved))
+    return (apart, left) if apart >= LOST_S and left < apart / 2 else None
 
 
 def _dropped(view: EpisodeView, clock: Clock) -> Iterator[Issue]:
-    """A camera that loses frames one by one; gaps are told apart.
-
-    Its place is the shortest span that holds half of the long steps.
-    """
+    """A camera that loses frames one by one; gaps are separate issues."""
     steps = np.diff(clock.time)
     small = steps < clock.shortest_gap_s
     begun, steps = clock.time[:-1][small], steps[small]
@@ -236,82 +221,42 @@ def _dropped(view: EpisodeView, clock: Clock) -> Iterator[Issue]:
     long, lost = len(places), float(steps.sum()) / clock.step_s - len(steps)
     if long < DROPPED or min(long, lost) <= DROPPED_SHARE * len(steps):
         return
-    starts, stops = begun[places], (begun + steps)[places][(long - 1) // 2 :]
-    most = int(np.argmin(stops - starts[: len(stops)]))
-    span = float(starts[most]), float(stops[most])
     message = (
         f"{long} of {len(steps)} steps take at least {DROPPED_STEP:g} times the usual "
-        f"{1e3 * clock.step_s:.0f} ms (up to {1e3 * steps.max():.0f} ms), half of them here: there "
-        f"is time for {lost:.0f} more frames; {len(steps) / steps.sum():.1f} Hz on average"
+        f"{1e3 * clock.step_s:.0f} ms (up to {1e3 * steps.max():.0f} ms): there is time for "
+        f"{lost:.0f} more frames; {len(steps) / steps.sum():.1f} Hz on average"
     )
+    span = float(begun[places[0]]), float((begun + steps)[places[-1]])
     yield view.issue("dropped frames", clock.name, message, *span)
 
 
-def _rate(view: EpisodeView, clock: Clock, expected_hz: float, where: str) -> Iterator[Issue]:
-    """The mean rate, without gaps that are told anyway: also entries lost one by one show in it."""
-    covered = float(np.ptp(clock.time)) - sum(gap.length_s for gap in clock.gaps)
-    rate = (len(clock.time) - 1 - len(clock.gaps)) / covered if covered > 0 else float("inf")
-    if abs(rate - expected_hz) > RATE_TOLERANCE * expected_hz:
-        message = f"found {rate:.4g} entries a second, expected {expected_hz:.4g} by {where}"
-        yield view.issue("rate", clock.name, message)
-
-
 def _lost_ticks(view: EpisodeView, recorded: Sequence[Clock]) -> Iterator[Issue]:
-    """What a stream costs that begins after most of the others or ends before most of them."""
-    starts = [float(clock.time[0]) for clock in recorded]
-    # A clock that was set ends where it would have without.
-    stops = [
-        clock.time[-1] - sum(gap.length_s - clock.step_s for gap in _find_jumps(clock, recorded))
-        for clock in recorded
-    ]
-    middle = (len(recorded) - 1) // 2
-    for edge, extreme, usual, words in (
-        (starts, max(starts), sorted(starts)[middle], "begins {:.2f} s after most others"),
-        (stops, min(stops), sorted(stops)[-1 - middle], "ends {:.2f} s before most others"),
-    ):
-        lost, tick_s, length_s = abs(extreme - usual), _tick_s(view), view.duration_s
-        near = min(LOST_S, lost) / 2
-        late = [c for c, at in zip(recorded, edge, strict=True) if abs(at - extreme) <= near]
-        steps = (DROPPED_STEP * clock.step_s for clock in late)
-        if lost >= LOST_S or lost > max(LOST_SHARE * length_s, LOST_TICKS * tick_s, *steps):
-            cost = f"about {lost / tick_s:.0f} ticks, {100 * lost / length_s:.0f} % of the episode"
+    """A stream that begins after most of the others or ends before most of them."""
+    # A clock that was set has its own issue, and says nothing of where the others end.
+    clocks = [c for c in recorded if not any(_ends_apart(c, gap, recorded) for gap in c.gaps)]
+    if len(clocks) < 2:
+        return
+    middle, tick_s = (len(clocks) - 1) // 2, _tick_s(view)
+    least_s = max(LOST_TICKS * tick_s, min(LOST_S, LOST_SHARE * view.duration_s))
+    for place, sign, words in ((0, 1, "begins {:.2f} s after"), (-1, -1, "ends {:.2f} s before")):
+        # The later, the further into the episode, from its start or back from its stop.
+        inward = [sign * float(clock.time[place]) for clock in clocks]
+        extreme, usual = max(inward), sorted(inward)[middle]
+        lost_s = extreme - usual
+        near_s = min(LOST_S, lost_s) / 2
+        late = [c for c, at in zip(clocks, inward, strict=True) if extreme - at <= near_s]
+        if lost_s > max(least_s, *(DROPPED_STEP * clock.step_s for clock in late)):
+            share = 100 * lost_s / view.duration_s
+            cost = f"about {lost_s / tick_s:.0f} ticks, {share:.0f} % of the episode"
+            message = f"{words.format(lost_s)} most others, which costs {cost}"
             names = ", ".join(clock.name for clock in late)
-            message = f"{words.format(lost)}, which costs {cost}"
-            yield view.issue("lost ticks", names, message, *sorted((extreme, usual)))
+            span = sorted((sign * usual, sign * extreme))
+            yield view.issue("lost ticks", names, message, *span)
 
 
 def _tick_s(view: EpisodeView) -> float:
     line = view.timeline
     return _TICK_S if line is None or len(line.time) < 2 else usual_step(line.time)
-
-
-def _old_frames(view: EpisodeView) -> Iterator[Issue]:
-    """Cameras that are slower than the VL rows, so that rows see the frame of the row before."""
-    line = view.timeline
-    if line is None or len(line.time) < 2:
-        return
-    served = int(np.count_nonzero(line.vl_row == 0)) * usual_step(line.time)
-    for name, shown in line.frame_time.items():
-        age = line.time - shown[line.vl_row]
-        usual, oldest = float(np.median(age)), int(np.argmax(age))
-        if usual > OLD * served:
-            message = (
-                f"frames are {usual:.2f} s old at the median tick and {age[oldest]:.2f} s at most, "
-                f"expected at most {OLD * served:.2f} s where a VL row serves {served:.2f} s"
-            )
-            at = float(line.time[oldest])
-            yield view.issue("old frames", f"view {name}", message, at, at)
-
-
-GAP_COLOUR = "#D55E00"
-# Colour of a stroke, in the order of the lanes: what feeds a lane stands above it.
-_KINDS = {"stream": PALETTE[4], "camera": PALETTE[0], "vl_row": PALETTE[2], "tick": INK}
-# Strokes that a lane has room for: of entries nearer than that, one is drawn.
-_STROKES = 1500
-# VL rows shown from near, and seconds without any.
-_ROWS_NEAR, _NEAR_S = 5, 1.5
-# Of a lane: how far its marks reach up and down.
-_HALF = 0.36
 
 
 def clock_blocks(view: EpisodeView, draw: Draw, params: Params) -> list[Block]:
@@ -321,7 +266,7 @@ def clock_blocks(view: EpisodeView, draw: Draw, params: Params) -> list[Block]:
         return []
     caption = (
         "When each stream was sampled; hatched boxes are gaps. Lines lead from frames to the VL "
-        "row that took them, brackets from a VL row to the ticks that reuse it."
+        "row that took them, and from there to the ticks that reuse it."
     )
     return [draw("clocks", caption, draw_lanes), clock_table(view, clocks)]
 
@@ -343,12 +288,15 @@ def clock_table(view: EpisodeView, clocks: Sequence[Clock]) -> Table:
 
 
 def draw_lanes(view: EpisodeView) -> Figure:
-    """A lane a clock: over the whole episode, and about five VL rows from near.
+    """A lane a clock: over the whole episode above, about five VL rows below.
 
-    From near, lines lead from each frame to the VL row that took it, and brackets from the row to
-    the ticks that reuse it. Streams that were sampled by one clock share a lane.
+    Below, lines lead from each frame to the VL row that took it, and from the row to the ticks that
+    reuse it. Streams with the very same times share a lane.
     """
-    clocks = _in_reading_order(read_clocks(view))
+    recorded = [clock for clock in read_clocks(view) if len(clock.time)]
+    streams = _merge_equal(clock for clock in recorded if clock.kind == "stream")
+    clocks = [*streams, *(clock for clock in recorded if clock.kind != "stream")]
+    clocks.sort(key=lambda clock: [*_KINDS].index(clock.kind))
     start = min(float(clock.time[0]) for clock in clocks)
     stop = max(float(clock.time[-1]) for clock in clocks)
     near = _choose_near(view, clocks, start, stop)
@@ -362,30 +310,19 @@ def draw_lanes(view: EpisodeView) -> Figure:
         axis.set_yticks(range(len(clocks)), [clock.name for clock in clocks])
         axis.set_ylim(len(clocks) - 0.2, -0.7)
     whole.axvspan(near[0] - view.zero, near[1] - view.zero, color=GRID, lw=0, zorder=0.3)
-    whole.set_title("the whole episode (grey: the stretch below)", loc="left", fontsize=10)
+    whole.set_title("the whole episode", loc="left", fontsize=10)
     if view.timeline is not None:
         lanes = {clock.name: lane for lane, clock in enumerate(clocks)}
         _draw_reuse(detail, view.timeline, view.zero, lanes, near)
-    detail.set_title(f"from near: {near[1] - near[0]:.2f} s", loc="left", fontsize=10)
+    detail.set_title(f"the grey part: {near[1] - near[0]:.2f} s", loc="left", fontsize=10)
     detail.set_xlabel("time since the recording began [s]")
     return figure
-
-
-def _in_reading_order(clocks: Sequence[Clock]) -> list[Clock]:
-    """Those with an entry, by kind; streams with the very same times are one of all their names."""
-    shown = [clock for clock in clocks if len(clock.time)]
-    streams = merge_equal(clock for clock in shown if clock.kind == "stream")
-    others = [clock for clock in shown if clock.kind != "stream"]
-    return sorted([*streams, *others], key=lambda clock: [*_KINDS].index(clock.kind))
 
 
 def _choose_near(
     view: EpisodeView, clocks: Sequence[Clock], start: float, stop: float
 ) -> tuple[float, float]:
-    """The stretch in s that is shown from near: five VL rows, around a gap if any.
-
-    The first gap of the topmost lane that has one; without any, the middle.
-    """
+    """Start and stop in s of the lower picture: five VL rows, around the first gap if any."""
     line = view.timeline
     step = float("nan") if line is None else usual_step(line.vl_time)
     width = min(_ROWS_NEAR * step if step > 0 else _NEAR_S, max(stop - start, 1e-3))
@@ -395,7 +332,7 @@ def _choose_near(
 
 
 def _draw_lane(axis: Axes, clock: Clock, lane: int, zero: float) -> None:
-    """A stroke an entry, where entries are dense one a place; and the gaps."""
+    """A stroke an entry, where there is room, and the gaps."""
     low, high = axis.get_xlim()
     time = clock.time[(clock.time >= low + zero) & (clock.time <= high + zero)] - zero
     places = ((time - low) / (high - low) * _STROKES).astype(np.int64)
@@ -405,27 +342,26 @@ def _draw_lane(axis: Axes, clock: Clock, lane: int, zero: float) -> None:
     # One artist for all: thousands of gaps as patches take many seconds.
     axis.broken_barh(
         spans, (lane - _HALF, 2 * _HALF), facecolor="none", hatch="////", lw=1.4,
-        edgecolor=GAP_COLOUR, hatchcolor=GAP_COLOUR,
+        edgecolor=_GAP_COLOUR, hatchcolor=_GAP_COLOUR,
     )  # fmt: skip
 
 
 def _draw_reuse(
     axis: Axes, line: Timeline, zero: float, lanes: Mapping[str, int], near: tuple[float, float]
 ) -> None:
-    """Lines from frames to VL rows and brackets from VL rows to ticks, between two instants."""
-    colour = _KINDS["vl_row"]
-    row_lane, tick_lane = lanes["VL rows"], lanes["ticks"]
-    rows = np.unique(line.vl_row[(line.time >= near[0]) & (line.vl_time[line.vl_row] <= near[1])])
+    """Lines from frames to the VL rows that took them, and from VL rows to the ticks they serve."""
+    ticks = np.flatnonzero((line.time >= near[0]) & (line.vl_time[line.vl_row] <= near[1]))
+    rows, row_lane = np.unique(line.vl_row[ticks]), lanes["VL rows"]
     for name, time in line.frame_time.items():
         lane = lanes[f"view {name}"]
-        tops = [(at - zero, lane) for at in time[rows]]
-        ends = zip(tops, [(at - zero, row_lane - _HALF) for at in line.vl_time[rows]], strict=True)
-        axis.add_collection(LineCollection([*ends], colors=colour, label=f"took {name}"))
-        axis.plot(time[rows] - zero, [lane] * len(rows), "o", ms=5, color=colour, zorder=4)
-    for row in rows:
-        ticks = line.time[line.vl_row == row] - zero
-        across, low = [ticks[0], ticks[0], ticks[-1], ticks[-1]], tick_lane - 0.5
-        axis.plot(across, [row_lane + _HALF, low, low, tick_lane - _HALF], color=colour, lw=1.6)
-        if line.vl_time[row] >= near[0]:
-            at = float(line.vl_time[row]) - zero
-            axis.text(at, row_lane, f" row {row}", color=colour, size=8, va="center", clip_on=True)
+        _connect(axis, time[rows] - zero, lane, line.vl_time[rows] - zero, row_lane - _HALF)
+        axis.plot(time[rows] - zero, [lane] * len(rows), "o", ms=5, color=_KINDS["vl_row"])
+    begin, end = line.vl_time[line.vl_row[ticks]] - zero, line.time[ticks] - zero
+    _connect(axis, begin, row_lane + _HALF, end, lanes["ticks"] - _HALF)
+
+
+def _connect(
+    axis: Axes, start: NDArray[Any], start_lane: float, stop: NDArray[Any], stop_lane: float
+) -> None:
+    ends = [[(a, start_lane), (b, stop_lane)] for a, b in zip(start, stop, strict=True)]
+    axis.add_collection(LineCollection(ends, colors=_KINDS["vl_row"]))

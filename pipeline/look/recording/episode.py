@@ -1,7 +1,7 @@
-"""A recording -> all of it that can be read, and an issue for each part that cannot.
+"""One recording with every part that can be read, and an issue for every part that cannot.
 
-All times are float64 seconds on the recording's own clock; `EpisodeView.zero` is what pictures and
-tables subtract.
+All times are float64 seconds on the recording's own clock; pictures and tables subtract
+`EpisodeView.zero`.
 """
 
 from collections.abc import Callable, Mapping
@@ -21,17 +21,17 @@ from pipeline.data import CameraStream, RecordedAction, Recording, Stream
 from pipeline.data.timeline import ActionRotation, Timeline, build_timeline
 from pipeline.look.page.blocks import Picture
 
-# What a damaged recording raises: a reader's word, or a disk's.
+# What reading a damaged recording raises.
 BROKEN = (RecordingError, OSError)
 
 
 @dataclass(frozen=True)
 class EpisodeView:
-    """One recording with everything of it that could be read.
+    """One recording with every part that could be read.
 
-    What could not is None, or absent from `cameras`, and an issue of kind `unreadable` says why.
-    `action` is as recorded, `timeline.action` what the ticks have; `zero` is the first instant of
-    all clocks, `action_rotation` how `timeline` derived actions from poses.
+    A part that could not is None, or absent from `cameras`, and an issue of kind `unreadable` says
+    why. `action` is as recorded, `timeline.action` is at the ticks; `zero` is the first instant of
+    all clocks; `action_rotation` is how `timeline` derived actions from poses.
     """
 
     recording: Recording
@@ -54,7 +54,7 @@ class EpisodeView:
 
     @property
     def clocks(self) -> dict[str, NDArray[np.float64]]:
-        """The times of all that was recorded: `view View1`, …, `sensor`, `state`, …"""
+        """The times of every camera and stream, by name: `view View1`, …, `sensor`, `state`, …"""
         cameras = {f"view {view}": camera.time for view, camera in self.cameras.items()}
         return cameras | {name: stream.time for name, stream in self.streams.items()}
 
@@ -62,8 +62,8 @@ class EpisodeView:
     def shown(self) -> dict[str, Stream]:
         """The streams that a page shows, by name.
 
-        The action is what the ticks have, as recorded where there is no tick; poses that are
-        columns of the state are left out.
+        The action is that of the ticks, or as recorded without ticks; poses that are columns of the
+        state are left out.
         """
         streams, line = self.streams, self.timeline
         if {"poses", "state"} <= streams.keys():
@@ -83,9 +83,9 @@ class EpisodeView:
     def issue(
         self, kind: str, stream: str, message: str, *span: float, severity: Severity = "warning"
     ) -> Issue:
-        """An issue of this episode; `span` is its start and stop, nothing for all of the stream.
+        """An issue of this episode; `span` is its start and stop on the clock, if it has a place.
 
-        Its times are seconds since `zero`, as a page counts them.
+        The issue's times are seconds since `zero`, as a page counts them.
         """
         start_s, stop_s = (at - self.zero for at in span) if span else (None, None)
         return Issue(
@@ -94,16 +94,16 @@ class EpisodeView:
         )  # fmt: skip
 
 
-# Makes a picture of an episode from a name, a caption and what draws it.
+# Makes a picture of an episode from a name, a caption and the function that draws it.
 Draw = Callable[[str, str, Callable[[EpisodeView], Figure]], Picture]
 
 
 def view_episode(recording: Recording, data: DataParams, rotation: ActionRotation) -> EpisodeView:
-    """Whatever of this recording can be read, and its ticks under `data`; no frame is decoded.
+    """Every part of this recording that can be read, and its ticks under `data`.
 
-    A part that cannot be read is None (no cameras: empty) and becomes an issue `unreadable`,
-    streams that leave no tick an issue `no ticks`; both are errors. Raises nothing for a broken
-    recording, and `ConfigError` where poses need `data.action_hz`.
+    No frame is decoded. A part that cannot be read becomes an issue `unreadable`, streams that
+    leave no tick an issue `no ticks`; both are errors. A broken recording raises nothing. Raises
+    `ConfigError` where poses need `data.action_hz`.
     """
     broken: dict[str, str] = {}
 
@@ -118,10 +118,10 @@ def view_episode(recording: Recording, data: DataParams, rotation: ActionRotatio
     names = ("cameras", "sensor", "state", "action", "instruction")
     parts = {name: attempt(name) for name in names}
     parts["cameras"] = parts["cameras"] or {}
-    # Poses are most often columns of the state, whose issue has said what is wrong.
+    # Poses are mostly columns of the state: a broken state is one issue, not two.
     parts["poses"] = None if "state" in broken else attempt("poses")
     view = EpisodeView(recording, **parts, action_rotation=rotation)
-    # One broken file breaks every stream that is in it: its message stands once.
+    # One broken file breaks every stream in it: its message stands once.
     issues = [
         view.issue(
             "unreadable", ", ".join(s for s in broken if broken[s] == message), message,
@@ -139,7 +139,7 @@ def view_episode(recording: Recording, data: DataParams, rotation: ActionRotatio
 
 
 def runs(flags: NDArray[np.bool_]) -> list[tuple[int, int]]:
-    """First place of each run of set flags, and one past its last.
+    """Start and stop of each run of set flags.
 
     Where a flag stands between an entry and the next, these are a run's first and last entry.
     """
@@ -148,7 +148,7 @@ def runs(flags: NDArray[np.bool_]) -> list[tuple[int, int]]:
 
 
 def _timeline(view: EpisodeView, data: DataParams) -> Timeline:
-    # What was read stands in the place of what would read it again.
+    # The parts that were read replace the methods that would read them again.
     read = copy(view.recording)
     read.cameras, read.poses, read.action = (
         partial(getattr, view, name) for name in ("cameras", "poses", "action")

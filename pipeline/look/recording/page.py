@@ -1,21 +1,41 @@
-"""Recordings -> their page: all in a table, what looks wrong, some of them in every detail."""
+"""All recordings: read and checked one by one, and their page.
+
+The rules and thresholds of most issues stand in `clocks`, `streams` and `cameras`; here are those
+of what is missing, and of several recordings. Most rules look for what is unlike the rest of the
+same episode, so they expect nothing of the robot.
+"""
 
 import re
-from collections.abc import Sequence
+from collections import defaultdict
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from functools import lru_cache
+from hashlib import blake2b
+from pathlib import Path
+
+import numpy as np
+from tqdm import tqdm
 
 from pipeline.base.config import Params
+from pipeline.base.errors import RecordingError, StoreMismatch
 from pipeline.base.format import duration
+from pipeline.base.issue import Issue
 from pipeline.base.table import Table
-from pipeline.data import Opened
+from pipeline.data import Opened, Recording
+from pipeline.data.episode import Embodiment, common_embodiment
+from pipeline.data.recording import Nominal
+from pipeline.data.timeline import ActionRotation, choose_action_rotation, rate_notes
 from pipeline.look.page.blocks import Issues, Picture, Report, Section, Text
-from pipeline.look.recording.channels import statistics_blocks
-from pipeline.look.recording.clocks import clock_blocks
+from pipeline.look.recording.cameras import camera_blocks, find_frame_issues
+from pipeline.look.recording.clocks import clock_blocks, find_clock_issues
 from pipeline.look.recording.episode import Draw, EpisodeView, view_episode
-from pipeline.look.recording.frames import camera_blocks
-from pipeline.look.recording.model_input import prompt_blocks, sample_blocks
-from pipeline.look.recording.overview import RecordingsOverview, survey_recordings, worst_first
-from pipeline.look.recording.streams import motion_blocks, sensor_blocks
+from pipeline.look.recording.samples import prompt_blocks, sample_blocks
+from pipeline.look.recording.streams import (
+    find_channel_issues,
+    motion_blocks,
+    sensor_blocks,
+    statistics_blocks,
+)
 
 _TOPICS = {
     "Camera views": camera_blocks,
@@ -25,16 +45,232 @@ _TOPICS = {
     "Statistics by channel": statistics_blocks,
 }
 NOTHING = "Nothing looks wrong: every episode was read and every check passed."
-# Episodes that the table of all shows at most: those with findings, then the first.
+# Most episodes in the table of all: those with issues, then the first.
 ROWS = 100
 
 
+@dataclass
+class RecordingSummary:
+    """One recording in a line.
+
+    `counts` are entries by clock (`EpisodeView.clocks`), `digests` those of its motion by stream.
+    """
+
+    source: str
+    episode: str
+    format: str
+    path: Path
+    instruction: str | None
+    duration_s: float
+    ticks: int
+    vl_rows: int
+    counts: Mapping[str, int]
+    digests: Mapping[str, str]
+    issues: list[Issue]
+
+    @property
+    def frames(self) -> dict[str, int]:
+        """Number of frames by view."""
+        views = {name: count for name, count in self.counts.items() if name.startswith("view ")}
+        return {name.removeprefix("view "): count for name, count in views.items()}
+
+    @property
+    def errors(self) -> int:
+        """Number of errors among its issues."""
+        return sum(issue.severity == "error" for issue in self.issues)
+
+    @property
+    def warnings(self) -> int:
+        """Number of warnings among its issues."""
+        return len(self.issues) - self.errors
+
+
+@dataclass(frozen=True)
+class RecordingsOverview:
+    """All recordings that were opened, and everything that is wrong with them.
+
+    `summaries` stand in the order in which recordings were opened; `common` are the issues of whole
+    sources and of recordings that could not be opened; `rotation` is the kind of rotation that
+    `data.action_rotation` gives for these recordings.
+    """
+
+    summaries: tuple[RecordingSummary, ...]
+    common: tuple[Issue, ...]
+    rotation: ActionRotation
+
+    @property
+    def issues(self) -> tuple[Issue, ...]:
+        """The common ones, then episode by episode."""
+        return (*self.common, *(issue for summary in self.summaries for issue in summary.issues))
+
+    @property
+    def views(self) -> tuple[str, ...]:
+        """The views of all recordings, sorted."""
+        return tuple(sorted({view for summary in self.summaries for view in summary.frames}))
+
+    def choose(self, count: int) -> tuple[int, ...]:
+        """At most `count` places in `summaries` to look at closely, in their order.
+
+        Those with most errors, then most warnings, come first; the others are evenly spread.
+        """
+        ranked = worst_first(self.summaries)
+        worst = [place for place in ranked if self.summaries[place].issues][:count]
+        sound = [place for place in range(len(self.summaries)) if place not in worst]
+        left = min(count - len(worst), len(sound))
+        spread = np.linspace(0, len(sound) - 1, left).round().astype(int).tolist() if left else []
+        return tuple(sorted([*worst, *(sound[place] for place in spread)]))
+
+
+def worst_first(summaries: Sequence[RecordingSummary]) -> list[int]:
+    """Their places, those with most errors, then most warnings, first."""
+    counts = [(-summary.errors, -summary.warnings) for summary in summaries]
+    return sorted(range(len(summaries)), key=counts.__getitem__)
+
+
+def survey_recordings(opened: Opened, params: Params) -> RecordingsOverview:
+    """Read and check every recording; a broken one keeps no other from being read.
+
+    Raises `ConfigError` where poses need `data.action_hz`.
+    """
+    rotation = choose_action_rotation(params.data.action_rotation, opened.recordings)
+    summaries: list[RecordingSummary] = []
+    embodiments: list[tuple[Recording, Embodiment]] = []
+    rates: list[tuple[str, float | None, float]] = []
+    for recording in tqdm(opened.recordings, "inspecting", unit="episode", disable=None):
+        view = view_episode(recording, params.data, rotation)
+        summaries.append(_summarise(view))
+        if (line := view.timeline) is not None:
+            kind = Embodiment.of(line.action_channels, line.action_kind, view.sensor, view.state)
+            embodiments.append((recording, kind))
+            rates.append((recording.source, line.recorded_hz, line.fastest_hz))
+    _warn_of_duplicates(summaries)
+    common = list(_not_opened(opened))
+    try:
+        if embodiments:
+            common_embodiment(embodiments, "store", "Inspect and extract them apart.")
+    except StoreMismatch as error:
+        common.append(Issue(severity="error", kind="embodiment", message=str(error)))
+    # Where ticks are not the recorded rows.
+    for source, note in rate_notes(rates, params.data.action_hz).items():
+        note += "; with data.action_hz null the recorded rows are the ticks"
+        common.append(_warning("tick rate", note, source, stream="ticks"))
+    return RecordingsOverview(tuple(summaries), tuple(common), rotation)
+
+
+def _summarise(view: EpisodeView) -> RecordingSummary:
+    recording, line = view.recording, view.timeline
+    return RecordingSummary(
+        source=recording.source,
+        episode=recording.id,
+        format=recording.format,
+        path=recording.path,
+        instruction=view.instruction,
+        duration_s=view.duration_s,
+        ticks=0 if line is None else len(line.time),
+        vl_rows=0 if line is None else len(line.vl_time),
+        counts={name: len(time) for name, time in view.clocks.items()},
+        digests=_digest_motion(view),
+        issues=list(find_issues(view)),
+    )
+
+
+def find_issues(view: EpisodeView) -> tuple[Issue, ...]:
+    """The issues of this episode, those of reading it included: errors first, then by time."""
+    issues = list(view.issues)
+    try:
+        nominal = view.recording.nominal()
+    except RecordingError as error:
+        nominal = Nominal()
+        # The same file may be the reason why a stream cannot be read.
+        if str(error) not in {issue.message for issue in issues}:
+            issues.append(view.issue("unreadable", "metadata", str(error)))
+    issues += [view.issue("wrong metadata", "", mistake) for mistake in nominal.mistakes]
+    issues += [*find_clock_issues(view), *_missing(view, nominal)]
+    issues += [*find_channel_issues(view), *find_frame_issues(view)]
+    issues.sort(key=lambda issue: (issue.severity != "error", issue.start_s or float("-inf")))
+    return tuple(issues)
+
+
+def _missing(view: EpisodeView, nominal: Nominal) -> Iterator[Issue]:
+    """Streams, cameras and views that are missing, and depth maps, which are no views."""
+    unread = {name for issue in view.issues for name in issue.stream.split(", ")}
+    for name, entry in nominal.streams.items():
+        if name not in view.streams and name not in unread:
+            message = f"no file holds it, but {nominal.where} says {entry}: copy the file, too"
+            yield view.issue("missing", name, message)
+    for name in view.recording.depth_views():
+        message = "a depth map by the metadata, no picture: it is no view, the VLM does not see it"
+        yield view.issue("depth view", f"view {name}", message)
+    if "cameras" in unread:
+        return
+    # Those that `data.views` leaves out, too.
+    recorded, empty = view.recording.all_views(), view.recording.empty_views()
+    if not view.cameras:
+        left_out = f"; data.views leaves out {', '.join(recorded)}" if recorded else ""
+        message = f"no camera has a frame{left_out}: the VLM would see no picture"
+        yield view.issue("missing", "cameras", message)
+    for name in empty:
+        yield view.issue("missing", f"view {name}", "its folder is there and holds no frame")
+
+
+def _digest_motion(view: EpisodeView) -> dict[str, str]:
+    """Digests of the values of state and action, or of the sensor without either.
+
+    Streams that never change are left out: they can be equal by chance. So are clocks: two formats
+    give the same rows different times.
+    """
+    motion = {name: view.streams[name] for name in ("state", "action") if name in view.streams}
+    streams = motion or ({} if view.sensor is None else {"sensor": view.sensor})
+    return {
+        name: blake2b(stream.values.tobytes(), digest_size=16).hexdigest()
+        for name, stream in streams.items()
+        if np.ptp(stream.values, axis=0).any()
+    }
+
+
+def _warn_of_duplicates(summaries: Sequence[RecordingSummary]) -> None:
+    """Warn of episodes whose streams have the values of an earlier one, where both have them."""
+    firsts: dict[tuple[str, str], list[RecordingSummary]] = defaultdict(list)
+    for summary in summaries:
+        for first in (first for digest in summary.digests.items() for first in firsts[digest]):
+            common = sorted(summary.digests.keys() & first.digests.keys(), reverse=True)
+            if all(summary.digests[name] == first.digests[name] for name in common):
+                source = "" if first.source == summary.source else f"{first.source}/"
+                named = f"{source}{first.episode} ({first.path})"
+                equal = f"all values of {' and '.join(common)} are equal"
+                message = f"the same recording as {named}: {equal}, and nothing else was compared"
+                place = summary.source, summary.episode
+                summary.issues.append(_warning("duplicate recording", message, *place))
+                break
+        else:
+            for digest in summary.digests.items():
+                firsts[digest].append(summary)
+
+
+def _not_opened(opened: Opened) -> Iterator[Issue]:
+    for bad in opened.bad:
+        yield Issue(
+            severity="error", kind="unreadable", message=bad.reason,
+            source=bad.source, episode=bad.where.name,
+        )  # fmt: skip
+    for line in opened.missing:
+        source, _, message = line.partition(": ")
+        yield _warning("missing", message, source)
+
+
+def _warning(kind: str, message: str, source: str, episode: str = "", stream: str = "") -> Issue:
+    return Issue(
+        severity="warning", kind=kind, message=message,
+        source=source, episode=episode, stream=stream,
+    )  # fmt: skip
+
+
 def recordings_report(opened: Opened, params: Params, name: str) -> Report:
-    """The page of these recordings, which `name` is what a reader calls them.
+    """The page of these recordings, which the reader knows as `name`.
 
     Every recording is read and checked, one in memory at a time; `inspect.episodes` of them are
-    shown in detail. Pictures read their recording again when they are drawn. What cannot be shown
-    is a sentence on the page. Raises `ConfigError` where poses need `data.action_hz`.
+    shown in detail. Pictures read their recording again when they are drawn. A sentence stands in
+    for every part that cannot be shown. Raises `ConfigError` where poses need `data.action_hz`.
     """
     overview = survey_recordings(opened, params)
     summaries, chosen = overview.summaries, overview.choose(params.inspect.episodes)
@@ -49,7 +285,7 @@ def recordings_report(opened: Opened, params: Params, name: str) -> Report:
             f"{prefix}{name}", caption, lambda: draw(view_of(index))
         )
 
-    # Of the episodes shown, the one with fewest errors that has ticks: what a model would get.
+    # The model's input is shown for the episode with fewest errors that has ticks.
     model = min(chosen, key=lambda index: (not summaries[index].ticks, summaries[index].errors))
     sections = [
         Section("What looks wrong", [Issues(overview.issues, NOTHING)]),
@@ -109,12 +345,12 @@ def _episodes_table(overview: RecordingsOverview, chosen: Sequence[int]) -> Tabl
 def _episode_section(
     overview: RecordingsOverview, index: int, view: EpisodeView, draw: Draw, params: Params
 ) -> Section:
-    """Everything of one episode."""
+    """Every topic of one episode."""
     summary = overview.summaries[index]
     words = f"`{summary.path}`, format {summary.format}: “{summary.instruction or '–'}”"
     several = len({summary.source for summary in overview.summaries}) > 1
     title = f"{summary.source} / {summary.episode}" if several else summary.episode
-    absent = Text("This episode has nothing of this.")
+    absent = Text("The episode has none.")
     parts = {topic: blocks_of(view, draw, params) for topic, blocks_of in _TOPICS.items()}
     return Section(
         title, [Text(words)], [Section(topic, parts[topic] or [absent]) for topic in parts]

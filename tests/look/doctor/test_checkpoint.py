@@ -9,8 +9,7 @@ import torch
 from safetensors.torch import save_file
 
 from pipeline.base.config import Params
-from pipeline.look.doctor.checkpoint import check, check_adapter, check_fit
-from pipeline.look.doctor.gpu import GPU
+from pipeline.look.doctor.machine import GPU, check_adapter, check_checkpoint, check_fit
 from pipeline.simulation.demo_recordings import MARKER
 
 GIB = 2**30
@@ -35,7 +34,7 @@ def params(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Make:
 
 
 def test_a_whole_folder(params: Make, demo_checkpoint: Path) -> None:
-    here, fits = check(params(demo_checkpoint))
+    here, fits = check_checkpoint(params(demo_checkpoint))
     assert (here.severity, fits.severity) == ("ok", "ok")
     assert "whole, 2,519,424 parameters" in here.message
     assert fits.message.startswith("9.6 MiB in float32, memory has")
@@ -47,7 +46,7 @@ def test_the_demos_random_weights_are_nothing_to_learn_from(
     """Wherever the folder that stages.demo marks lies."""
     mine = shutil.copytree(demo_checkpoint, tmp_path / "mine")
     (mine / MARKER).write_text('{"seed": 0}')
-    here, fits = check(params(mine))
+    here, fits = check_checkpoint(params(mine))
     assert (here.severity, fits.severity) == ("note", "ok")
     assert "whole, " in here.message and "random weights" in here.message
     assert "Qwen/Qwen2.5-VL-3B-Instruct" in here.remedy and "docs/real-model.md" in here.remedy
@@ -56,7 +55,7 @@ def test_the_demos_random_weights_are_nothing_to_learn_from(
 def test_a_folder_with_a_hole(params: Make, demo_checkpoint: Path, tmp_path: Path) -> None:
     broken = shutil.copytree(demo_checkpoint, tmp_path / "broken")
     next(broken.glob("*.safetensors")).unlink()
-    (issue,) = check(params(broken))
+    (issue,) = check_checkpoint(params(broken))
     assert issue.severity == "error"
     assert str(broken) in issue.message
 
@@ -67,16 +66,16 @@ def test_a_file_that_is_cut_off(params: Make, demo_checkpoint: Path, tmp_path: P
     whole = weights.read_bytes()
     for kept in (whole[:-1], whole[:5], b"\x08" + bytes(7) + b"garbage!"):
         weights.write_bytes(kept)
-        (issue,) = check(params(broken))
+        (issue,) = check_checkpoint(params(broken))
         assert (issue.severity, issue.remedy) == ("error", "copy it again")
         assert f"{weights}: cut off or damaged: " in issue.message
 
 
 def test_what_is_not_here(params: Make) -> None:
-    (folder,) = check(params("/no/such/folder"))
+    (folder,) = check_checkpoint(params("/no/such/folder"))
     assert folder.severity == "error" and "no hub id" in folder.message
     hub = params("Qwen/Qwen2.5-VL-3B-Instruct")
-    (fetched,) = check(hub)
+    (fetched,) = check_checkpoint(hub)
     assert fetched.severity == "note" and "first extraction downloads it" in fetched.message
     assert fetched.remedy == "hf download Qwen/Qwen2.5-VL-3B-Instruct"
 
@@ -85,7 +84,7 @@ def test_the_demos_own_checkpoint_is_written_by_its_stage(params: Make, tmp_path
     absent = tmp_path / "demo_vlm"
     given = params(absent)
     given = given.model_copy(update={"demo": given.demo.model_copy(update={"checkpoint": absent})})
-    (issue,) = check(given)
+    (issue,) = check_checkpoint(given)
     assert issue.severity == "error"
     assert "stages.demo" in issue.remedy
 

@@ -10,7 +10,7 @@ import pytest
 
 from pipeline.base.config import Params, Source
 from pipeline.data import BadEpisode, open_recordings
-from pipeline.look.doctor.data import check, check_source, check_video
+from pipeline.look.doctor.data import check_recordings, check_source, check_video
 
 
 def params(root: Path, *sources: dict[str, Any], **data: Any) -> Params:
@@ -29,7 +29,7 @@ def test_sources_are_counted_and_the_videos_codec_is_named(recordings: Path) -> 
         {"name": "raw", "path": "raw"},
         {"name": "lerobot", "path": str(recordings / "lerobot")},
     )
-    root, raw, lerobot, videos = check(given)
+    root, raw, lerobot, videos = check_recordings(given)
     assert {root.severity, raw.severity, lerobot.severity, videos.severity} == {"ok"}
     assert raw.message.startswith("2 episode(s), raw")
     assert "2 episode(s), lerobot" in lerobot.message
@@ -37,16 +37,16 @@ def test_sources_are_counted_and_the_videos_codec_is_named(recordings: Path) -> 
 
 
 def test_what_is_not_there_is_missing(recordings: Path) -> None:
-    (root,) = check(params(recordings / "nowhere", {"name": "a", "path": "a"}))
+    (root,) = check_recordings(params(recordings / "nowhere", {"name": "a", "path": "a"}))
     assert root.severity == "error" and "nowhere: no such folder" in root.message
-    *_, source = check(params(recordings, {"name": "monday", "path": "2025-*"}))
+    *_, source = check_recordings(params(recordings, {"name": "monday", "path": "2025-*"}))
     assert (source.severity, source.kind) == ("error", "monday")
     assert "matches nothing" in source.message
 
 
 def test_the_demos_recordings_are_made_by_its_stage(tmp_path: Path) -> None:
     given = params(Path("elsewhere"), {"name": "a", "path": "a"})
-    *_, issue = check(given)
+    *_, issue = check_recordings(given)
     assert "stages.demo" in issue.remedy
 
 

@@ -4,8 +4,14 @@ import pytest
 import torch
 
 from pipeline.base.config import Params
-from pipeline.look.doctor import gpu
-from pipeline.look.doctor.gpu import FLASH, GPU, check_attention, check_gpus, read_gpus
+from pipeline.look.doctor.machine import (
+    FLASH,
+    GPU,
+    check_attention,
+    check_gpu,
+    check_gpus,
+    read_gpus,
+)
 
 H100 = GPU("NVIDIA H100", 80 * 2**30, True)
 
@@ -31,7 +37,7 @@ def test_a_gpu_that_torch_does_not_see(driver: bool, said: str) -> None:
 def test_what_the_params_ask_for_by_name_is_needed() -> None:
     lacking = [
         issue
-        for issue in gpu.check(params(extract={"device": "cuda:77"}))
+        for issue in check_gpu(params(extract={"device": "cuda:77"}))
         if issue.severity == "error"
     ]
     assert [issue.kind for issue in lacking] == ["extract.device"], "it is said once"

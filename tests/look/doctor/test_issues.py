@@ -9,7 +9,7 @@ import pytest
 from pipeline.base.config import Params
 from pipeline.base.errors import ConfigError
 from pipeline.look import doctor as machine
-from pipeline.look.doctor import WIDTH, described, missing, note, ok
+from pipeline.look.doctor import WIDTH, describe, missing, note, ok
 
 
 @pytest.fixture
@@ -30,14 +30,14 @@ def only(monkeypatch: pytest.MonkeyPatch) -> Callable[[Any], None]:
             return SimpleNamespace(check=check)
 
         monkeypatch.setattr(machine, "import_module", load)
-        monkeypatch.setattr(machine, "GROUPS", {"A group": "one"})
+        monkeypatch.setattr(machine, "GROUPS", {"A group": ("one", "check")})
 
     return set_check
 
 
 def test_lines_stay_within_the_width_and_words_whole() -> None:
     command = "pip install --force-reinstall torch --index-url https://a.example/" + "x" * 20
-    lines = described("A group", [ok("subject", "word " * 40), note("other", "found", command)])
+    lines = describe("A group", [ok("subject", "word " * 40), note("other", "found", command)])
     assert lines[0] == "A group" and lines[-1] == ""
     assert all(len(line) <= WIDTH for line in lines)
     assert sum(line.startswith("  ok ") for line in lines) == 1

@@ -5,12 +5,12 @@ import re
 import pytest
 
 from pipeline.base.config import Params
-from pipeline.look.doctor.packages import check, check_required, installed_version
+from pipeline.look.doctor import check_packages, check_required, installed_version
 
 
 def test_the_projects_own_ranges_hold_here() -> None:
     document = {"data": {"sources": [{"name": "a", "path": "."}]}, "vlm": {"checkpoint": "a/b"}}
-    (issue,) = check(Params.model_validate(document))
+    (issue,) = check_packages(Params.model_validate(document))
     assert issue.severity == "ok"
     assert re.search(r"(\d+) of \1 .*python 3\.\d+.*, torch \d+\.\d+", issue.message)
     assert installed_version("no-such-package-at-all") is None
@@ -22,7 +22,7 @@ def test_a_logger_is_needed_only_where_the_params_ask_for_it() -> None:
         "vlm": {"checkpoint": "a/b"},
         "train_head": {"loggers": ["wandb"]},
     }
-    issues = {issue.kind for issue in check(Params.model_validate(document))}
+    issues = {issue.kind for issue in check_packages(Params.model_validate(document))}
     assert ("wandb" in issues) == (installed_version("wandb") is None)
     assert "tensorboard" not in issues
 

@@ -114,7 +114,7 @@ def test_without_scripts_and_on_paper_all_is_there(
     drawn = browser_page(every_page, scheme="dark").page
     drawn.emulate_media(media="print")
     # What is folded on a screen cannot be unfolded on paper.
-    assert drawn.locator("details.document pre").bounding_box()["height"] > 20
+    assert drawn.locator("details.outline pre").bounding_box()["height"] > 20
     assert drawn.pdf()[:5] == b"%PDF-"
 
 

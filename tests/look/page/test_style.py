@@ -8,15 +8,14 @@ import pytest
 from matplotlib.figure import Figure
 
 from pipeline.evaluate.curves import TrainingCurve, TrainingCurves
-from pipeline.look.evaluation.pictures import curves
+from pipeline.look.evaluation import draw_curves
 from pipeline.look.page import style
 
 
 def test_axes_of_powers_of_ten_say_plain_numbers() -> None:
     steps = np.arange(1, 200)
-    course = curves(TrainingCurves({"train/loss": TrainingCurve(steps, 10.0 / steps**2)}), 1).axes[
-        0
-    ]
+    loss = TrainingCurve(steps, 10.0 / steps**2)
+    (course,) = draw_curves(TrainingCurves({"train/loss": loss}), 1).axes
     course.figure.draw_without_rendering()
     said = [label.get_text() for label in course.get_yticklabels(which="both")]
     assert "0.01" in said

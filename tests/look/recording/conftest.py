@@ -17,7 +17,7 @@ from pipeline.data import Channels, Stream, open_recordings
 from pipeline.data.timeline import choose_action_rotation
 from pipeline.look.page.style import RC
 from pipeline.look.recording.episode import EpisodeView, view_episode
-from pipeline.look.recording.overview import find_issues
+from pipeline.look.recording.page import find_issues
 from pipeline.simulation import rendering
 from pipeline.simulation.insertion_formats import (
     ABUTTING,

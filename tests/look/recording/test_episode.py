@@ -7,11 +7,10 @@ import numpy as np
 import pytest
 
 from pipeline.base.errors import RecordingError
-from pipeline.look.recording.channels import channel_statistics
+from pipeline.look.recording.cameras import read_frames, spread_ticks
 from pipeline.look.recording.clocks import read_clocks
 from pipeline.look.recording.episode import EpisodeView
-from pipeline.look.recording.frames import read_frames, spread_ticks
-from pipeline.look.recording.overview import find_issues
+from pipeline.look.recording.page import find_issues
 
 Look = Callable[..., EpisodeView]
 
@@ -49,7 +48,7 @@ def test_a_nan_leaves_the_other_streams(copied, look: Look, change_npz) -> None:
     assert view.sensor is None and view.state is not None and len(view.cameras) == 3
     assert view.timeline is not None and not view.timeline.sensor_end.any()
     assert find_issues(view)[0] == issue
-    assert {one.stream for one in channel_statistics(view)} == {"state", "action"}
+    assert view.shown.keys() == {"state", "action"}
 
 
 def test_a_backwards_clock_leaves_the_other_streams(copied, look: Look, change_csv) -> None:
@@ -83,7 +82,7 @@ def test_a_truncated_file_is_told_once(copied, look: Look) -> None:
     assert not view.clocks and view.zero == 0 and view.duration_s == 0
     assert view.instruction is None
     assert find_issues(view) == (issue,)
-    assert read_clocks(view) == [] and not list(channel_statistics(view))
+    assert read_clocks(view) == [] and view.shown == {}
     with pytest.raises(RecordingError):
         _ = view.recording.instruction
 

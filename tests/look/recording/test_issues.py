@@ -15,9 +15,9 @@ from pipeline.base.channels import named
 from pipeline.base.config import DataParams, Source
 from pipeline.base.issue import Issue
 from pipeline.data import open_recordings
-from pipeline.look.recording.channels import find_channel_issues
 from pipeline.look.recording.clocks import find_clock_issues
 from pipeline.look.recording.episode import EpisodeView, view_episode
+from pipeline.look.recording.streams import find_channel_issues
 
 Find = Callable[..., tuple[Issue, ...]]
 Copied = Callable[[str], Path]
@@ -44,12 +44,12 @@ def test_a_real_camera_that_loses_frames(shared_data: Path) -> None:
     found = {
         one.id: issue.message
         for one in recordings
-        for issue in find_clock_issues(view_episode(one, data, "rotvec"), one.nominal())
+        for issue in find_clock_issues(view_episode(one, data, "rotvec"))
         if issue.kind == "dropped frames"
     }
     assert found == {
-        "episode_000000": "13 of 175 steps take at least 1.5 times the usual 99 ms (up to 233 ms), "
-        "half of them here: there is time for 18 more frames; 9.2 Hz on average"
+        "episode_000000": "13 of 175 steps take at least 1.5 times the usual 99 ms (up to 233 ms): "
+        "there is time for 18 more frames; 9.2 Hz on average"
     }
 
 
@@ -162,18 +162,6 @@ class TestCameras:
         twice = [time_of(path) for path in paths[1::2]]
         assert (issue.start_s, issue.stop_s) == (twice[0], twice[-1])
 
-    def test_frames_that_change_in_size(self, copied: Copied, issues_of: Find) -> None:
-        folder = copied("raw")
-        noisy(folder, "View1")
-        paths = frames(folder, "View1")
-        for path in paths[40:]:
-            Image.open(path).resize((160, 90)).save(path)
-        paths[39].write_bytes(paths[38].read_bytes())  # an equal pair just before the change
-        (issue,) = issues_of(folder, views=["View1"], vlm_reuse_count=1)
-        assert (issue.kind, issue.stream, issue.severity) == ("frame size", "view View1", "warning")
-        assert issue.start_s == issue.stop_s == time_of(paths[40])
-        assert "from 224 x 126 (frame 39) to 160 x 90 (frame 40)" in issue.message
-
     def test_one_picture_throughout(self, copied: Copied, issues_of: Find) -> None:
         folder = copied("raw")
         paths = frames(folder, "View5")
@@ -196,15 +184,6 @@ class TestCameras:
         video.write_bytes(video.read_bytes()[:2000])
         (issue,) = issues_of(root)
         assert (issue.kind, issue.severity, issue.stream) == ("unreadable", "error", "view View1")
-
-    def test_frames_left_out(self, copied: Copied, issues_of: Find) -> None:
-        folder = copied("raw")
-        paths = frames(folder, "View2")
-        for path in paths[1::3]:
-            path.unlink()
-        (issue,) = issues_of(folder)
-        assert (issue.kind, issue.stream) == ("frame count", "view View2")
-        assert issue.message.startswith(f"{len(paths) - len(paths[1::3])} frames, ")
 
     def test_fewer_frames_than_the_metadata_says(self, copied: Copied, issues_of: Find) -> None:
         folder = copied("new")
@@ -316,17 +295,6 @@ class TestCameras:
             path.rename(path.with_name(f"{path.stem.rsplit('_', 1)[0]}_{time:.3f}.jpg"))
         assert issues_of(folder) == ()
 
-    def test_slower_than_the_rows_that_need_it(self, copied: Copied, issues_of: Find) -> None:
-        folder = copied("raw")
-        for view in ("View1", "View2", "View5"):
-            for index, path in enumerate(frames(folder, view)):
-                if index % 20:
-                    path.unlink()
-        old = [issue for issue in issues_of(folder) if issue.kind != "lost ticks"]
-        assert {issue.kind for issue in old} == {"old frames"}
-        assert {issue.stream for issue in old} == {"view View1", "view View2", "view View5"}
-        assert "expected at most 0.60 s" in old[0].message
-
 
 class TestClocks:
     def test_a_gap(self, copied: Copied, issues_of: Find, change_csv) -> None:
@@ -349,7 +317,6 @@ class TestClocks:
         kinds = {issue.kind: issue for issue in issues_of(folder)}
         assert "gap" in kinds and kinds["gap"].stream == "view View2"
         assert kinds["gap"].start_s == pytest.approx(time_of(gone[0]), abs=0.2)
-        assert "ticks see a frame up to 1." in kinds["gap"].message
 
     def test_each_of_many_gaps_has_its_time(
         self, copied: Copied, issues_of: Find, change_csv
@@ -373,25 +340,6 @@ class TestClocks:
         assert issue.start_s is not None and issue.stop_s is not None
         assert issue.stop_s - issue.start_s == pytest.approx(3600, abs=0.1)
         assert "jumps by 3600.0" in issue.message
-
-    def test_times_that_repeat(self, copied: Copied, issues_of: Find, change_csv) -> None:
-        folder = copied("raw")
-
-        def coarse(table: np.ndarray) -> np.ndarray:
-            table[:, 1] = np.floor(table[:, 1] / 0.05) * 0.05
-            return table
-
-        change_csv(only(folder, "robot_state_*.csv"), coarse)
-        (issue,) = issues_of(folder)
-        assert (issue.kind, issue.stream) == ("repeated times", "state, poses")
-
-    def test_another_rate_than_the_metadata_says(self, copied: Copied, issues_of: Find) -> None:
-        folder = copied("new")
-        metadata(folder, sensor_hz=800)
-        (issue,) = issues_of(folder)
-        assert (issue.kind, issue.stream) == ("rate", "sensor")
-        assert "found 65" in issue.message
-        assert "entries a second, expected 800 by metadata.json" in issue.message
 
     def test_another_rate_than_fps(self, copied: Copied, issues_of: Find) -> None:
         root = copied("lerobot")

@@ -13,7 +13,7 @@ import pytest
 from pipeline.base.config import Params, Source
 from pipeline.base.issue import Issue
 from pipeline.data import open_recordings
-from pipeline.look.recording.overview import RecordingsOverview, survey_recordings
+from pipeline.look.recording.page import RecordingsOverview, survey_recordings
 
 
 def survey(*sources: Source, views: Sequence[str] | None = None, **data: Any) -> RecordingsOverview:
@@ -70,23 +70,6 @@ def test_one_broken_episode_hides_no_other(many: Path) -> None:
     (issue,) = found.issues
     assert broken.issues == [issue] and issue.severity == "error"
     assert found.choose(1) == (1,) and found.choose(2) == (0, 1) and found.choose(9) == (0, 1, 2)
-
-
-def test_what_most_episodes_of_a_source_have(many: Path) -> None:
-    (many / "c" / "robot_states.npz").unlink()
-
-    def missing() -> tuple[str, str]:
-        found = survey(Source(name="s", path=str(many)))
-        (issue,) = [issue for issue in found.issues if issue.kind == "missing"]
-        assert found.summaries[2].warnings == 1
-        return issue.episode, issue.stream
-
-    assert missing() == ("c", "state")  # its own metadata count them
-    pickled = many / "c" / "data.pkl"
-    document = pickle.loads(pickled.read_bytes())
-    del document["metadata"]["num_robot_states"]
-    pickled.write_bytes(pickle.dumps(document))
-    assert missing() == ("c", "poses, state")
 
 
 def test_the_same_recording_twice(many: Path) -> None:

@@ -8,10 +8,10 @@ import pytest
 
 from pipeline.base.config import Params, load_params
 from pipeline.base.table import Table
-from pipeline.look.page.blocks import Document, Issues, Picture, Report, Text, Tokens
+from pipeline.look.page.blocks import Issues, Picture, Report, Text, Tokens
 from pipeline.look.page.writing import write_report
 from pipeline.look.recording.page import recordings_report
-from pipeline.look.recording.subject import subject_of
+from pipeline.look.subject import subject_of
 
 PARAMS = Path(__file__).resolve().parents[3] / "params.yaml"
 
@@ -52,8 +52,6 @@ def test_the_page_of_a_recording_is_whole_and_sound(
     assert 95 < state[average] < state[usual] - 0.5
     (sensor,) = [one for one in report.blocks(Picture) if one.name.endswith("sensor")]
     assert "by 6 times its noise" in sensor.caption
-    (document,) = report.blocks(Document)
-    assert document.content["digest"]
     (prompt,) = report.blocks(Tokens)
     sizes = next(one for one in report.blocks(Table) if "image tokens" in one.columns)
     assert [row[1:3] for row in sizes.rows] == [("126 × 224", "112 × 168")] * 3

@@ -15,10 +15,9 @@ from pipeline.base.channels import unnumbered
 from pipeline.base.config import Params
 from pipeline.data import Channels, Stream
 from pipeline.look.page.blocks import Picture, Text
-from pipeline.look.recording.channels import statistics_blocks
+from pipeline.look.recording.cameras import camera_blocks, draw_views
 from pipeline.look.recording.clocks import Clock, clock_blocks, clock_table, draw_lanes
 from pipeline.look.recording.episode import EpisodeView
-from pipeline.look.recording.frames import camera_blocks, draw_views
 from pipeline.look.recording.streams import (
     contacts,
     draw_motion,
@@ -26,6 +25,7 @@ from pipeline.look.recording.streams import (
     group_channels,
     motion_blocks,
     sensor_blocks,
+    statistics_blocks,
 )
 
 PARAMS = Params.model_validate(
@@ -195,24 +195,19 @@ def test_many_gaps_are_one_artist(felt: Felt) -> None:
     assert len(drawn.get_paths()) == 99 and not whole.patches[1:]
 
 
-def test_lines_lead_from_the_frame_to_its_row_and_brackets_to_its_ticks(view: EpisodeView) -> None:
+def test_lines_lead_from_the_frame_to_its_row_and_from_there_to_its_ticks(
+    view: EpisodeView,
+) -> None:
     assert view.timeline is not None
     line, (_, near) = view.timeline, draw_lanes(view).axes
-    said = [text.get_text() for text in near.texts if "row" in text.get_text()]
-    row = int(said[0].split()[1])
-    took = [
-        one for one in near.collections
-        if isinstance(one, LineCollection) and str(one.get_label()).startswith("took")
-    ]  # fmt: skip
-    assert [one.get_label() for one in took] == ["took View1", "took View2", "took View5"]
-    ends = [tuple(segment[0]) for segment in took[0].get_segments()]
-    assert any(x == pytest.approx(line.frame_time["View1"][row] - view.zero) for x, _ in ends)
-    served = line.time[line.vl_row == row] - view.zero
-    brackets = [one.get_xdata() for one in near.lines if len(one.get_xdata()) == 4]
-    assert any(
-        (one[0], one[-1]) == (pytest.approx(served[0]), pytest.approx(served[-1]))
-        for one in brackets
-    )
+    lines = [lines for lines in near.collections if isinstance(lines, LineCollection)]
+    # After the strokes of the lanes.
+    *took, served = [np.array(ends.get_segments())[..., 0] + view.zero for ends in lines[-4:]]
+    for name, ends in zip(("View1", "View2", "View5"), took, strict=True):
+        rows = np.searchsorted(line.vl_time, ends[:, 1] - 1e-6)
+        assert ends[:, 0] == pytest.approx(line.frame_time[name][rows])
+    ticks = np.searchsorted(line.time, served[:, 1] - 1e-6)
+    assert served[:, 0] == pytest.approx(line.vl_time[line.vl_row[ticks]])
 
 
 def test_a_long_clock_has_as_many_strokes_as_there_is_room_for(felt: Felt) -> None:

@@ -1,4 +1,4 @@
-"""The prompt is what the model gets, and its spec is found without reading files again."""
+"""The prompt on the page is what the model gets."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -6,80 +6,17 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.base import digests
-from pipeline.base.config import Params, VLMParams, load_params
-from pipeline.base.digests import ContentDigests
+from pipeline.base.config import VLMParams
 from pipeline.base.errors import RecordingError, VLMError
 from pipeline.base.table import Table
 from pipeline.look.page.blocks import Text, Tokens
 from pipeline.look.recording.episode import EpisodeView
-from pipeline.look.recording.model_input import (
-    LEDGER,
-    describe_stretch,
-    digest_ledger,
-    fold_tokens,
-    remembered_spec,
-    show_prompt,
-)
+from pipeline.look.recording.samples import describe_stretch, fold_tokens, show_prompt
 from pipeline.vlm.feature_spec import FeatureSpec, feature_spec
 from pipeline.vlm.preparation import Preparer
 from pipeline.vlm.processor import TokenKind
 
 Look = Callable[..., EpisodeView]
-PARAMS = Path(__file__).resolve().parents[3] / "params.yaml"
-
-
-@pytest.fixture
-def params(demo_checkpoint: Path, tmp_path: Path) -> Params:
-    return load_params(
-        PARAMS,
-        [
-            f"vlm.checkpoint={demo_checkpoint}",
-            f"inspect.output={tmp_path / 'pages'}",
-            f"extract.store={tmp_path / 'stores' / 'one.zarr'}",
-        ],
-    )
-
-
-@pytest.fixture
-def read(monkeypatch: pytest.MonkeyPatch) -> list[Path]:
-    """The files whose content is read for a digest."""
-    found: list[Path] = []
-    really: Callable[[Path], str] = digests.file_digest
-
-    def counted(path: Path) -> str:
-        found.append(path)
-        return really(path)
-
-    monkeypatch.setattr(digests, "file_digest", counted)
-    return found
-
-
-def test_a_checkpoint_is_read_once(params: Params, read: list[Path], tmp_path: Path) -> None:
-    first = remembered_spec(params, ["View1"])
-    assert any(path.suffix == ".safetensors" for path in read)
-    read.clear()
-    assert remembered_spec(params, ["View1"]) == first
-    assert read == []
-    assert [path.name for path in tmp_path.rglob("*") if path.is_file()] == [LEDGER]
-
-
-def test_what_extraction_has_read_is_not_read_again(
-    params: Params, read: list[Path], tmp_path: Path
-) -> None:
-    ledger = tmp_path / "stores" / "one.zarr.files.sqlite"
-    known = digests.ContentDigests(ledger)
-    for path in params_files(params):
-        known.of(path)
-    known.close()
-    read.clear()
-    assert digest_ledger(params) == ledger
-    remembered_spec(params, ["View1"])
-    assert read == [] and not (tmp_path / "pages").exists()
-
-
-def params_files(params: Params) -> list[Path]:
-    return [path for path in Path(params.vlm.checkpoint).iterdir() if path.is_file()]
 
 
 class TestPrompt:
@@ -90,9 +27,8 @@ class TestPrompt:
         )
 
     @pytest.fixture
-    def spec(self, vlm: VLMParams, tmp_path: Path) -> FeatureSpec:
-        digests = ContentDigests(tmp_path / "digests.json")
-        return feature_spec(vlm, "float32", ["View1", "View2", "View5"], digests.of)
+    def spec(self, vlm: VLMParams) -> FeatureSpec:
+        return feature_spec(vlm, "float32", ["View1", "View2", "View5"], lambda path: "")
 
     def test_it_is_what_the_model_gets(self, healthy: Path, look: Look, vlm, spec) -> None:
         view = look(healthy / "old")

@@ -14,7 +14,7 @@ from pipeline.base.config import Params
 from pipeline.base.errors import RecordingError
 from pipeline.datasets import UnifiedVLADataset
 from pipeline.look.recording.episode import EpisodeView
-from pipeline.look.recording.model_input import (
+from pipeline.look.recording.samples import (
     Sample,
     batch_table,
     cut_samples,

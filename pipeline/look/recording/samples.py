@@ -1,10 +1,8 @@
-"""What the model and the policy get of a recording: samples, the batch, the prompt, its tokens."""
+"""What policy and model get of a recording: training samples, the batch, the prompt as tokens."""
 
 from collections.abc import Mapping, Sequence
-from contextlib import closing
 from dataclasses import dataclass
 from itertools import groupby
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,27 +12,25 @@ from numpy.typing import NDArray
 
 from pipeline.base.clock import CLOCK_SLACK_S
 from pipeline.base.config import Params, VLMParams
-from pipeline.base.digests import ContentDigests, ledger_path
 from pipeline.base.errors import PipelineError, RecordingError
-from pipeline.base.ownership import LEDGER_SUFFIX as LEDGER
 from pipeline.base.table import Table
-from pipeline.look.page.blocks import Block, Document, Text, TokenRun, Tokens
+from pipeline.look.page.blocks import Block, Text, TokenRun, Tokens
 from pipeline.look.page.style import INK, draw_frame, panels
+from pipeline.look.recording.cameras import read_frames
 from pipeline.look.recording.episode import BROKEN, Draw, EpisodeView
-from pipeline.look.recording.frames import read_frames
 from pipeline.look.recording.streams import Group, legend_beside, named_groups, plot_curves
 from pipeline.vlm.feature_spec import FeatureSpec, feature_spec
 from pipeline.vlm.preparation import Preparer
 from pipeline.vlm.processor import TokenKind
 
-# Of the picture, as long as its columns are no narrower than the least; and what is beside them. At
-# a page's width its smallest text, 8 points, then is no smaller than 8 pixels.
+# The picture fills this width unless its columns get too narrow: then its smallest text, 8 points,
+# is no smaller than 8 pixels on a page. Beside the columns stand labels and legends.
 _WIDTH_IN, _BESIDE_IN = 10.0, 1.6
 _LEAST_COLUMN_IN, _COLUMN_IN, _PANEL_IN = 1.65, 2.5, 1.15
 _SMALL = 8
 # Characters of a title over the whole width.
 _TITLE = 120
-# A change of width over height that is said.
+# Least change of width over height that the table of images names.
 _STRETCHED = 0.05
 
 
@@ -110,9 +106,9 @@ def draw_samples(
 ) -> Figure:
     """The samples side by side, a column each: frames, windows, action chunk.
 
-    Windows end at their tick; hatched is what the episode had not recorded yet, and the steps of a
-    chunk that lie past its end and are masked. States are drawn as what they changed since the
-    first of the window.
+    Windows end at their tick. Hatched are the readings that the episode had not recorded yet, and
+    the steps of a chunk past its end, which training masks. States are drawn as their change since
+    the first of the window.
     """
     rows = named_groups({name: view.shown[name] for name in samples[0].windows})
     views = samples[0].frames
@@ -136,13 +132,13 @@ def draw_samples(
 
 
 def batch_table(samples: Sequence[Sample], lengths: Mapping[str, int]) -> Table:
-    """What of each window and chunk is real, a line a sample."""
+    """How much of each window and chunk is real, a row a sample."""
     streams = list(samples[0].windows)
     rows = [
         [sample.tick, *(f"{len(sample.windows[name])} of {lengths[name]}" for name in streams)]
         for sample in samples
     ]
-    caption = "The same samples as a batch: what of each is real, and not padded or masked."
+    caption = "The same samples as a batch: how much of each is real, and not padded or masked."
     heads = [f"{name} {'steps' if name == 'action' else 'readings'}" for name in streams]
     return Table(["tick", *heads], rows, caption)
 
@@ -150,7 +146,7 @@ def batch_table(samples: Sequence[Sample], lengths: Mapping[str, int]) -> Table:
 def _draw_row(
     axes: Sequence[Axes], name: str, group: Group, windows: Sequence[NDArray[Any]], length: int
 ) -> None:
-    """The panels of one group of channels, a sample each, of one range of values and colours."""
+    """The panels of one group of channels, a sample each, with the same values and colours."""
     ahead = name == "action"
     start, stop = (0.0, float(length)) if ahead else (0.5 - length, 0.5)
     limits = np.percentile(np.concatenate(windows), (1, 99.5)) if group.profile else (0, 1)
@@ -183,7 +179,7 @@ def _draw_row(
 
 
 def _sample_title(view: EpisodeView, tick: int) -> str:
-    """What tells a sample from the others, above its column."""
+    """Which tick a column shows, and how old its features are."""
     line = view.timeline
     assert line is not None
     row = line.vl_row[tick]
@@ -195,14 +191,13 @@ def _sample_title(view: EpisodeView, tick: int) -> str:
 
 
 def prompt_blocks(view: EpisodeView, params: Params, views: Sequence[str]) -> list[Block]:
-    """The prompt of the episode's first VL row, and the spec of the features of these views."""
-    spec: list[Block] = []
+    """The prompt of the episode's first VL row, or why it cannot be shown."""
     try:
-        found = remembered_spec(params, views)
-        spec = [Document("Feature spec: what decides what a feature is", found.attrs())]
-        return [*show_prompt(view, params.vlm, found), *spec]
+        # The digest does not change the prompt, and takes long: it reads every weight.
+        spec = feature_spec(params.vlm, params.extract.dtype, views, lambda path: "")
+        return show_prompt(view, params.vlm, spec)
     except PipelineError as error:
-        return [Text(f"The prompt cannot be shown: {error}"), *spec]
+        return [Text(f"The prompt cannot be shown: {error}")]
 
 
 def show_prompt(view: EpisodeView, vlm: VLMParams, spec: FeatureSpec) -> list[Block]:
@@ -225,45 +220,22 @@ def show_prompt(view: EpisodeView, vlm: VLMParams, spec: FeatureSpec) -> list[Bl
         (*preparer.describe(token), views.get(place))
         for place, token in enumerate(row.token_ids.tolist())
     ]
-    pixels = spec.image_size
+    high, wide = spec.image_size
+    rows: list[tuple[object, ...]] = []
+    for name in starts:
+        recorded = frames[name][0].shape[:2]
+        stretch = describe_stretch(recorded, spec.image_size)
+        rows.append((name, "{} × {}".format(*recorded), f"{high} × {wide}", stretch, size))
+    heads = ("view", "recorded [pixels]", "for the model [pixels]", "stretched", "image tokens")
     return [
         Text(f"{len(tokens):,} tokens, {len(views):,} of images."),
         Tokens(fold_tokens(tokens)),
-        Table(
-            ["view", "recorded [pixels]", "for the model [pixels]", "drawn out", "image tokens"],
-            [
-                (name, f"{high} × {wide}", "{} × {}".format(*pixels), stretch, size)
-                for name in starts
-                for high, wide in [frames[name][0].shape[:2]]
-                for stretch in [describe_stretch((high, wide), pixels)]
-            ],
-            "Image tokens by view; sizes are height × width",
-        ),
+        Table(heads, rows, "Image tokens by view; sizes are height × width"),
     ]
 
 
-def remembered_spec(params: Params, views: Sequence[str]) -> FeatureSpec:
-    """The spec of features that `params` give for these views.
-
-    A checkpoint is read whole for its digest, which takes seconds a gigabyte, and after that only
-    where a file of it has changed: digests are remembered in the ledger of `digest_ledger`. Raises
-    `VLMError` where the checkpoint is not there or incomplete.
-    """
-    with closing(ContentDigests.to_read(digest_ledger(params))) as digests:
-        return feature_spec(params.vlm, params.extract.dtype, views, digests.of)
-
-
-def digest_ledger(params: Params) -> Path:
-    """The ledger beside `extract.store` where extraction keeps one, else one in `inspect.output`.
-
-    Looking makes no file beside stores: whoever only looks may have none, or may not write there.
-    """
-    shared = ledger_path(params.extract.store)
-    return shared if shared.is_file() else params.inspect.output / LEDGER
-
-
 def describe_stretch(recorded: tuple[int, ...], pixels: tuple[int, int]) -> str | None:
-    """How a frame (height, width) is drawn out for the model; None for less than a twentieth."""
+    """How a frame (height, width) is stretched for the model; None for less than a twentieth."""
     wider = pixels[1] / pixels[0] / (recorded[1] / recorded[0])
     more = max(wider, 1 / wider) - 1
     return f"{more:.0%} in {'width' if wider > 1 else 'height'}" if more > _STRETCHED else None

@@ -18,8 +18,8 @@ from pipeline.evaluate.probe.folds import ProbeFolds
 from pipeline.evaluate.probe.inputs import SlotName
 from pipeline.evaluate.probe.ridge import ProbeScore
 from pipeline.evaluate.probe.study import Known, ProbeResult, ProbeStudy
-from pipeline.look.evaluation import draw_probe as probe
-from pipeline.look.evaluation import pictures as plots
+from pipeline.look import evaluation as plots
+from pipeline.look import probe
 from pipeline.look.page.style import write
 from pipeline.train.predictions import Predictions
 from pipeline.train.scores import ActionGroup, Comparison, compare
@@ -87,13 +87,15 @@ def pictures(comparison: Comparison, predictions: Predictions, store: Any) -> di
     instants = predictions.ticks[predictions.episodes == comparison.episodes[0]][[0, 6]]
 
     def chunks() -> Figure:
-        return plots.chunks(comparison, predictions, store, store.episodes[0], instants, frames)
+        return plots.draw_chunks(
+            comparison, predictions, store, store.episodes[0], instants, frames
+        )
 
     return {
-        "scatter.png": lambda: plots.scatter(comparison, predictions),
-        "horizon.png": lambda: plots.horizon(comparison, store.action_hz),
-        "methods.png": lambda: plots.methods(comparison),
-        "dimension_horizon.png": lambda: plots.dimension_horizon(comparison),
+        "scatter.png": lambda: plots.draw_scatter(comparison, predictions),
+        "horizon.png": lambda: plots.draw_horizon(comparison, store.action_hz),
+        "methods.png": lambda: plots.draw_methods(comparison),
+        "dimension_horizon.png": lambda: plots.draw_dimension_horizon(comparison),
         "chunks.png": chunks,
     }
 
@@ -132,8 +134,11 @@ def texts(figure: Figure) -> str:
 @pytest.mark.parametrize(
     ("draw", "said"),
     [
-        (lambda c, p, s: plots.scatter(c, p), ["recorded [mm]", "policy [mm]"]),
-        (lambda c, p, s: plots.horizon(c, 10.0), ["[100 ms each]", "mean absolute error [mm]"]),
+        (lambda c, p, s: plots.draw_scatter(c, p), ["recorded [mm]", "policy [mm]"]),
+        (
+            lambda c, p, s: plots.draw_horizon(c, 10.0),
+            ["[100 ms each]", "mean absolute error [mm]"],
+        ),
     ],
 )
 def test_axes_carry_units_and_titles_say_what_one_sees(
@@ -164,7 +169,7 @@ def test_frames_stand_above_the_chunks_that_were_made_of_them() -> None:
 def test_chunks_are_drawn_without_frames_and_end_with_their_episode() -> None:
     comparison, predictions, store = evaluated(2)
     last = np.array([23])
-    figure = plots.chunks(comparison, predictions, store, store.episodes[1], last, {})  # type: ignore[arg-type]
+    figure = plots.draw_chunks(comparison, predictions, store, store.episodes[1], last, {})  # type: ignore[arg-type]
     assert len(figure.axes) == 4
     assert "overall error" in figure.get_suptitle()
     (point,) = (line for line in figure.axes[0].lines if line.get_label().startswith("policy, wh"))
@@ -174,7 +179,7 @@ def test_chunks_are_drawn_without_frames_and_end_with_their_episode() -> None:
 def test_errors_by_dimension_and_step_are_in_training_deviations() -> None:
     comparison, *_ = evaluated(2)
     comparison = replace(comparison, scale=np.array([0.5, 1, 1, 2, 0.0]))
-    (axis, _) = plots.dimension_horizon(comparison).axes
+    (axis, _) = plots.draw_dimension_horizon(comparison).axes
     shown = np.asarray(axis.images[0].get_array())
     errors = comparison.scores["policy"].mae_horizon
     np.testing.assert_allclose(shown[0], errors[:, 0] / 0.5)
@@ -186,11 +191,11 @@ def test_errors_by_dimension_and_step_are_in_training_deviations() -> None:
 def test_methods_are_bars_with_whiskers_and_steps_have_bands_where_groups_are_two() -> None:
     for episodes in (1, 4):
         comparison, *_ = evaluated(episodes)
-        executed, chunk = plots.methods(comparison).axes
+        executed, chunk = plots.draw_methods(comparison).axes
         assert len(executed.patches) == len(chunk.patches) == 1 + len(BASELINES)
         assert chunk.patches[0].get_width() == pytest.approx(comparison.overall("policy"))
         assert len(chunk.lines) == (1 + len(BASELINES)) * (episodes > 1)
-        (axis,) = plots.horizon(comparison, 10.0).axes
+        (axis,) = plots.draw_horizon(comparison, 10.0).axes
         bands = [path for band in axis.collections for path in band.get_paths()]
         assert bool(bands) == (episodes > 1)
 
@@ -205,7 +210,7 @@ def test_curves_mark_the_step_that_was_judged() -> None:
             "train/other": [1.0, 1.0, 1.0],
         }.items()
     }
-    figure = plots.curves(TrainingCurves(logged), 20)
+    figure = plots.draw_curves(TrainingCurves(logged), 20)
     assert [axis.get_title() for axis in figure.axes] == ["training loss", "learning rate"]
     assert [axis.get_yscale() for axis in figure.axes] == ["log", "linear"]
     for axis in figure.axes:
@@ -217,10 +222,10 @@ def test_curves_mark_the_step_that_was_judged() -> None:
         "train/loss": TrainingCurve(steps, np.array([0.31, 0.29, 0.3])),
         "lr": TrainingCurve(steps[:1], steps[:1]),
     }
-    loss, rate = plots.curves(TrainingCurves(short), 20).axes
+    loss, rate = plots.draw_curves(TrainingCurves(short), 20).axes
     assert (loss.get_yscale(), loss.get_ylim()[0]) == ("linear", 0)
     assert rate.get_xlim() == loss.get_xlim()
-    (axis,) = plots.curves(TrainingCurves({"train/other": logged["train/other"]}), 5).axes
+    (axis,) = plots.draw_curves(TrainingCurves({"train/other": logged["train/other"]}), 5).axes
     assert axis.get_title() == "train/other"
 
 
@@ -232,7 +237,7 @@ def test_titles_of_groups_of_many_stay_within_their_panels() -> None:
         ActionGroup("translation", "rad/s", tuple(range(6, 12))),
     )
     comparison = replace(comparison, names=names, groups=groups)
-    figure = plots.horizon(comparison, 10.0)
+    figure = plots.draw_horizon(comparison, 10.0)
     figure.draw_without_rendering()
     left, right = (axis.title.get_window_extent() for axis in figure.axes)
     assert figure.axes[0].get_title() == "other, 6 dimension(s)"
@@ -248,7 +253,7 @@ def test_labels_of_a_scatter_lie_apart_whatever_the_range(scale: float) -> None:
         recorded=predictions.recorded * small,
         predicted=predictions.predicted * small,
     )
-    figure = plots.scatter(comparison, predictions)
+    figure = plots.draw_scatter(comparison, predictions)
     figure.draw_without_rendering()
     for axis in figure.axes[:4]:
         low, high = axis.get_xlim()
@@ -263,7 +268,7 @@ def test_labels_of_a_scatter_lie_apart_whatever_the_range(scale: float) -> None:
 
 def test_what_never_varies_takes_no_panel() -> None:
     comparison, *_ = evaluated(2)
-    assert len(plots.horizon(comparison, None).axes) == 1
+    assert len(plots.draw_horizon(comparison, None).axes) == 1
 
 
 def test_a_picture_never_writes_through_a_link(tmp_path: Path) -> None:
@@ -301,7 +306,7 @@ def studied(*errors: float) -> AblationStudy:
 
 
 def test_what_each_stream_is_worth_stands_beside_intact_and_best_baseline(tmp_path: Path) -> None:
-    figure = plots.modalities(studied(0.5, 1.0, 0.75, 2.0))
+    figure = plots.draw_modalities(studied(0.5, 1.0, 0.75, 2.0))
     (axis,) = figure.axes
     names = [label.get_text() for label in axis.get_yticklabels()]
     assert names == ["sensor zeroed", "sensor delayed 50 ms", "features shuffled"]
@@ -314,7 +319,7 @@ def test_what_each_stream_is_worth_stands_beside_intact_and_best_baseline(tmp_pa
 
 
 def test_a_policy_without_error_has_no_multiples() -> None:
-    (axis,) = plots.modalities(studied(0.0, 1.0, 0.0, 2.0)).axes
+    (axis,) = plots.draw_modalities(studied(0.0, 1.0, 0.0, 2.0)).axes
     assert not axis.patches and len(axis.get_yticks()) == 3
 
 
@@ -354,7 +359,7 @@ def probed(layers: int = 2) -> ProbeStudy:
 
 
 def test_slots_are_a_map_over_layers_and_cells_a_map_a_view(tmp_path: Path) -> None:
-    figure = probe.heat_map(probed())
+    figure = probe.draw_gains(probed())
     overview, *maps, bar = figure.axes
     assert [label.get_text() for label in overview.get_yticklabels()] == [
         "layer 0",
@@ -379,7 +384,7 @@ def test_slots_are_a_map_over_layers_and_cells_a_map_a_view(tmp_path: Path) -> N
     assert overview.images[0].get_clim() == pytest.approx((0.0, 0.31))
     assert len({axis.images[0].get_clim() for axis in (overview, *maps)}) == 1
     assert bar.lines[-1].get_ydata()[0] == 0
-    (file,) = write(tmp_path, {"probe.png": lambda: probe.heat_map(probed())})
+    (file,) = write(tmp_path, {"probe.png": lambda: probe.draw_gains(probed())})
     assert file.read_bytes().startswith(b"\x89PNG")
 
 
@@ -387,6 +392,6 @@ def test_what_is_far_below_the_mean_action_does_not_wash_out_the_others() -> Non
     study = probed()
     groups = [replace(study.groups[0], beside=score(-34.1, 20.0)), *study.groups[1:]]
     study = replace(study, groups=tuple(groups))
-    overview, *maps, _ = probe.heat_map(study).axes
+    overview, *maps, _ = probe.draw_gains(study).axes
     assert overview.images[0].get_clim() == pytest.approx((-0.69, 0.31))
     assert len({axis.images[0].get_clim() for axis in (overview, *maps)}) == 1

@@ -1,4 +1,4 @@
-"""Timings of a robot's loop -> pictures."""
+"""The picture of how a robot's loop keeps its deadlines."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -12,7 +12,7 @@ from pipeline.look.page.style import INK, PALETTE, finish, logarithmic, panels
 from pipeline.robot.timings import Timings
 
 _SLICES = 240
-"""Of a run over time: the latest tick of each is drawn."""
+"""Parts of a run of which the latest tick is drawn."""
 
 
 def jitter(runs: Mapping[str, tuple[float, Timings]]) -> Figure:
@@ -50,7 +50,7 @@ def jitter(runs: Mapping[str, tuple[float, Timings]]) -> Figure:
 def worst(
     time: NDArray[np.float64], values: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """The largest value of each of so many slices of time, and when the slice begins."""
+    """When each slice of the run begins, and its largest value."""
     if not len(values):
         return time, values
     starts = np.unique(np.linspace(0, len(values), _SLICES, endpoint=False).astype(int))

@@ -1,4 +1,4 @@
-"""The picture that says where in the model, and where in the image, the action is found."""
+"""The picture of a probe: where in the model, and where in the image, the action is."""
 
 from collections import defaultdict
 from collections.abc import Sequence
@@ -12,15 +12,15 @@ from pipeline.evaluate.probe.study import ProbeResult, ProbeStudy
 from pipeline.look.page.style import canvas, draw_map
 
 _MAPS = 6
-"""Maps of the cells of a view; most layers of a model look alike."""
+"""Most maps of the cells of a view; the layers of a model look alike."""
 _MAPS_A_ROW = 3
 
 
-def heat_map(study: ProbeStudy) -> Figure:
-    """What every slot gains: layers against what is pooled over, the best maps of a view's cells.
+def draw_gains(study: ProbeStudy) -> Figure:
+    """The gain of every slot over the baseline without features.
 
-    Over what is known without features. All take their colours from one scale, which spans what
-    is shown; what is more than 1 below its best has the darkest.
+    Above, layers by pooling; below, the best maps of a view's cells. All share one scale of
+    colours, from at most 1 below the best value shown up to it.
     """
     plain = [result for result in study.slots if result.name.cell is None]
     poolings = list({result.name.pooling: None for result in study.groups})
@@ -81,7 +81,7 @@ def _grid(places: Sequence[tuple[int, int]], values: Sequence[float]) -> NDArray
 
 
 def _limits(values: Sequence[float]) -> tuple[float, float]:
-    """From what is there; a very bad slot does not wash out the others."""
+    """The range of the values, at most 1, so that a very bad slot does not wash out the others."""
     high = max(values)
     low = max(min(values), high - 1.0)
     return (low, high) if high > low else (low - 0.5, high + 0.5)

@@ -17,9 +17,9 @@ from pipeline.evaluate.episode_frames import EpisodeFrames
 from pipeline.evaluate.evaluation import Evaluation, judged_document
 from pipeline.evaluate.figures import error, rivalry
 from pipeline.evaluate.tables import HEADINGS, error_table
-from pipeline.look.evaluation import page as evaluation_page
-from pipeline.look.evaluation.page import evaluation_report
-from pipeline.look.page.blocks import Document, Picture, Report, Section
+from pipeline.look import evaluation as evaluation_page
+from pipeline.look.evaluation import evaluation_report
+from pipeline.look.page.blocks import Outline, Picture, Report, Section
 from pipeline.look.page.writing import PAGE, write_report
 from pipeline.policy.checkpoint import PolicyCheckpoint
 from pipeline.policy.normalization import ChannelStatistics, Normalization
@@ -182,7 +182,7 @@ def test_episodes_that_were_trained_on_before_stand_at_the_top(judgement: Evalua
 
 
 def test_params_spec_and_what_was_judged_are_there(judgement: Evaluation) -> None:
-    trained, spec, source, judged = evaluation_report(judgement).blocks(Document)
+    trained, spec, source, judged = evaluation_report(judgement).blocks(Outline)
     assert trained.content["horizon"] == 4
     assert spec.content["digest"] == "tiny-spec"
     assert source.content["streams"]["action"]["names"] == ["dx", "dy", "dz", "da", "gripper"]

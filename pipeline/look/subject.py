@@ -1,4 +1,4 @@
-"""What a path on the command line is: recordings, or a store."""
+"""The subject of an inspection: recordings, or a store."""
 
 import glob
 import os
@@ -20,9 +20,9 @@ STORE = (".zarr", ".zarr.part")
 
 @dataclass(frozen=True)
 class Subject:
-    """What is looked at: recordings, or a store.
+    """What is inspected: recordings, or a store.
 
-    `name` is as the user said it, `folder` where its page goes, `store` None for recordings, whose
+    `name` is the user's, `folder` the place of the page; `store` is None for recordings, whose
     relative paths begin at `root`.
     """
 
@@ -33,7 +33,7 @@ class Subject:
     root: Path
 
     def recordings(self, views: Sequence[str] | None) -> Opened:
-        """Its recordings; raises `RecordingError` where there is none that can be looked at."""
+        """Its recordings; raises `RecordingError` where none can be opened."""
         opened = open_recordings(self.sources, self.root, views)
         if not opened.recordings:
             lines = [f"{self.name}: none of {len(opened.bad)} episode(s) can be looked at:"]
@@ -43,10 +43,10 @@ class Subject:
 
 
 def subject_of(params: Params) -> Subject:
-    """What `inspect.path` names, else the recordings of `data.sources`.
+    """The subject at `inspect.path`, or the recordings of `data.sources` without a path.
 
     A store is known by its content or its name. Raises `ConfigError` for a path that is not there
-    or is a file, for a store beside something else, and for an output that cannot be written to.
+    or is a file, for a store beside other paths, and for an output that cannot be written to.
     """
     wanted = params.inspect
     places = (wanted.path,) if isinstance(wanted.path, str) else wanted.path or ()
@@ -80,7 +80,7 @@ def subject_of(params: Params) -> Subject:
 
 
 def _check_output(folder: Path) -> None:
-    """Raise `ConfigError` now for what would stop the page once everything has been read."""
+    """Raise `ConfigError` before anything is read, where the page could not be written."""
     places = [folder.absolute(), *folder.absolute().parents]
     there = next(place for place in places if place.exists())
     wrong = "" if os.access(there, os.W_OK | os.X_OK) else f"{there} cannot be written to"
@@ -93,18 +93,18 @@ def _check_output(folder: Path) -> None:
 
 
 def _is_store(path: Path) -> bool:
-    """Whether it is a store by its content, or by its name and not of zarr v2, as none is."""
+    """Whether it is a store by its content, or by its name and not of zarr v2, which none is."""
     if (path / "zarr.json").is_file():
         return True
     return path.is_dir() and path.name.endswith(STORE) and not (path / ".zgroup").exists()
 
 
 def _folder(wanted: InspectParams, places: Sequence[str]) -> Path:
-    """The output as it was given, else a folder in it named after the paths, if any."""
+    """The output where it was set, else a folder in it named after the first path."""
     if "output" in wanted.model_fields_set or not places:
         return wanted.output
     first = os.path.relpath(places[0])
-    # A path elsewhere is named by its last parts: all of it would be no name.
+    # A path elsewhere is named by its last parts.
     parts = Path(first).parts if not first.startswith("..") else Path(places[0]).absolute().parts
     words = "_".join(parts[-3:]).replace("*", "any")
     name = re.sub(r"[^\w.-]+", "_", words).strip("_.")

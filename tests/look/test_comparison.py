@@ -9,7 +9,7 @@ import pytest
 from pipeline.base.table import Table
 from pipeline.evaluate.baselines import BASELINES
 from pipeline.evaluate.experiments import SPANS, Experiment
-from pipeline.look.evaluation.comparison import comparison_of_experiments, comparison_report
+from pipeline.look.comparison import comparison_report, draw_experiments
 from pipeline.look.page.writing import PAGE, write_report
 
 
@@ -60,7 +60,7 @@ def test_experiments_are_one_page(
 
 
 def test_bars_have_whiskers_and_seeds_are_dots(experiments: list[Experiment]) -> None:
-    figure = comparison_of_experiments(experiments)
+    figure = draw_experiments(experiments)
     executed, chunk = figure.axes
     assert [patch.get_width() for patch in executed.patches] == pytest.approx([0.3, 0.5])
     assert [patch.get_width() for patch in chunk.patches] == pytest.approx([0.5, 0.4])
@@ -88,5 +88,5 @@ def test_one_group_is_drawn_without_whiskers_and_it_is_said(experiments: list[Ex
     said = "of 1 group(s) of recordings. Intervals take at least two groups"
     assert said in comparison_report([alone]).summary
     assert "Intervals take" not in comparison_report(experiments).summary
-    executed, _ = comparison_of_experiments([alone]).axes
+    executed, _ = draw_experiments([alone]).axes
     assert not [line for line in executed.lines if line.get_marker() == "|"]

@@ -1,24 +1,31 @@
-"""What is said of a store is what stands in it, and what was planted is found, and nothing else."""
+"""The page of a store tells what is in it, and finds what was planted and nothing else."""
 
 import json
 import os
-import time
 import tracemalloc
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
+import matplotlib.image as mpl_image
 import numpy as np
 import pytest
 
 from pipeline.base.config import InspectParams
 from pipeline.base.errors import StoreIncomplete, StoreMismatch
-from pipeline.look.store.channels import summarize_streams
-from pipeline.look.store.episodes import EpisodeCoverage, find_episode_issues
-from pipeline.look.store.features import look_at_features, read_slot, sample_rows
-from pipeline.look.store.page import StoreView, inspect_store
-from pipeline.store import Episode, FeatureStore
+from pipeline.look.page.blocks import Issues, Outline, Report
+from pipeline.look.page.style import INK, write
+from pipeline.look.page.writing import write_report
+from pipeline.look.store import (
+    StoreView,
+    draw_norms,
+    inspect_store,
+    measure_features,
+    read_slot,
+    store_report,
+)
+from pipeline.store import FeatureStore
 from pipeline.store.chunks import write_seal
 
 ROWS = 10
@@ -71,12 +78,11 @@ class TestFacts:
         plant(path, "vl/frame_time", lambda shown: shown.__setitem__(3, np.nan))
         store, found = FeatureStore.open(path), look(path).ages
         expected = store.gather(np.arange(store.ticks)).feature_age.numpy()
-        assert np.array_equal(found.newest, expected)
+        assert np.array_equal(found["newest frame"], expected)
         rows = store.array("tick/vl_row")
         alone = store.array("tick/time") - store.array("vl/frame_time")[rows, 0]
-        assert np.allclose(found.by_view["View1"], alone, equal_nan=True)
-        assert np.isnan(found.by_view["View1"][rows == 3]).all()
-        assert found.period_s == pytest.approx(0.3)
+        assert np.allclose(found["View1"], alone, equal_nan=True)
+        assert np.isnan(found["View1"][rows == 3]).all()
 
     def test_its_size_is_all_bytes_on_the_disk(self, path):
         view = look(path)
@@ -86,7 +92,7 @@ class TestFacts:
     def test_coverage_is_counted_by_episode(self, path, plant):
         plant(path, "vl/frame_time", lambda shown: shown.__setitem__(slice(0, ROWS // 2), np.nan))
         first, second, *_ = look(path).episodes
-        assert (first.name, first.ticks) == ("left/episode_000", slice(0, 30))
+        assert first.episode.id == "episode_000"
         assert first.covered == {"sensor": 1.0, "state": 1.0, "View1": 0.5}
         assert second.covered["View1"] == 1
         assert first.seconds == pytest.approx(2.9)
@@ -113,31 +119,6 @@ class TestFacts:
         assert view.features.norm.shape == (6 * ROWS, 2)
         assert view.features.norm.max() < 100
 
-    def test_statistics_are_those_of_the_whole_stream(self, path):
-        values = FeatureStore.open(path).array("state/values")
-        found = next(one for one in look(path).statistics if one.stream == "state")
-        assert found.rows == found.looked_at == len(values)
-        for one, column in zip(found.channels, values.T, strict=True):
-            assert one.minimum == column.min() and one.maximum == column.max()
-            assert one.median == pytest.approx(np.median(column), abs=1e-6)
-            assert one.mean == pytest.approx(column.mean(), abs=1e-6)
-            assert one.std == pytest.approx(column.std(), rel=1e-5)
-
-    def test_a_large_stream_is_sampled_in_bounded_memory(self, tiny_store, tmp_path):
-        path = tiny_store(tmp_path, sensor_channels=64, readings_a_tick=250)
-        store = FeatureStore.open(path)
-        whole, limit = store.array("sensor/values").nbytes, 2**18
-        assert whole > 8e6
-        tracemalloc.start()
-        found = summarize_streams(store, limit)
-        peak = tracemalloc.get_traced_memory()[1]
-        tracemalloc.stop()
-        sensor = next(one for one in found if one.stream == "sensor")
-        assert sensor.rows == 45_000
-        assert sensor.looked_at == limit // (4 * 64)
-        assert sensor.channels[0].std == pytest.approx(1, abs=0.1)
-        assert peak < 6 * limit
-
     def test_what_is_no_finished_store_says_what_to_run(self, path, tmp_path):
         with pytest.raises(StoreIncomplete, match=r"stages\.extract"):
             look(tmp_path / "none.zarr")
@@ -152,42 +133,31 @@ class TestFacts:
             look(archive)
 
 
-class TestSampledRows:
-    def test_they_are_spread_evenly_over_the_store(self, tiny_store, tmp_path):
-        sampled = look(tiny_store(tmp_path, episodes=30), points=100).features.sampled
-        assert (len(sampled.rows), sampled.total) == (90, 300)
-        assert sampled.rows[:6].tolist() == [0, 4, 8, 10, 14, 18]
-        assert sampled.time[:4] == pytest.approx([0, 1.2, 2.4, 0])
-
-    def test_of_more_episodes_than_rows_to_look_at_some_are_left_out(self, tiny_store, tmp_path):
-        store = FeatureStore.open(tiny_store(tmp_path, episodes=30))
-        assert sample_rows(store, 15).rows.tolist() == list(range(0, 300, 2 * ROWS))
+def test_of_many_rows_evenly_spread_ones_are_looked_at(tiny_store, tmp_path):
+    health = look(tiny_store(tmp_path, episodes=30), points=100).features
+    assert health.rows[:6].tolist() == [0, 3, 6, 9, 12, 15] and len(health.rows) == 100
+    assert health.episode[:6].tolist() == [0, 0, 0, 0, 1, 1] and health.episode[-1] == 29
 
 
-class TestDuplicates:
-    def test_nothing_is_found_where_all_rows_differ(self, path):
-        found = look(path).duplicates
-        assert (found.rows, found.pairs) == (0, ())
-
+class TestSharedRows:
     def test_equal_keys_are_found_whatever_the_features(self, path, plant):
+        assert look(path).shared_rows == 0
+
         def same(keys: np.ndarray) -> None:
             keys[5 * ROWS : 5 * ROWS + 6] = keys[2:8]
 
         plant(path, "vl/key", same)
         view = look(path)
-        (pair,) = view.duplicates.pairs
-        assert (pair.first, pair.second, pair.rows) == (0, 5, (6, 6))
-        assert pair.share == pytest.approx(0.6)
-        assert pair.time_s == pytest.approx(0.6)
-        assert view.duplicates.rows == 12
-        assert kinds(view) == [("same recording", "left", "episode_000")]
+        assert view.shared_rows == 12
+        assert kinds(view) == [("same recording", "right", "episode_005")]
+        said = "6 of its 10 VL rows have exactly the frames and prompt of rows of left/episode_000"
+        assert view.issues[0].message == said
 
     def test_of_a_key_that_all_have_the_pairs_are_as_many_as_the_episodes(self, path, plant):
         plant(path, "vl/key", lambda keys: keys.__setitem__(slice(None), keys[0]))
-        found = look(path).duplicates
-        assert [(one.first, one.second) for one in found.pairs] == [(0, n) for n in range(1, 6)]
-        assert found.rows == 6 * ROWS
-        assert {one.rows for one in found.pairs} == {(ROWS, ROWS)}
+        view = look(path)
+        assert view.shared_rows == 6 * ROWS
+        assert [issue.episode for issue in view.issues] == [f"episode_00{n}" for n in range(1, 6)]
 
 
 class TestIntegrity:
@@ -223,20 +193,6 @@ class TestIssues:
         plant(path, "vl/features", lambda rows: rows.__setitem__(slice(30, 40), rows[30]))
         assert ("still features", "right", "episode_003") in kinds(look(path))
 
-    def test_a_feature_of_another_length(self, path, plant):
-        plant(path, "vl/features", lambda rows: rows.__setitem__((12, 0), rows[12, 0] * 100))
-        (issue,) = look(path).issues
-        assert (issue.kind, issue.episode, issue.start_s) == (
-            "feature norm",
-            "episode_001",
-            pytest.approx(0.6),
-        )
-
-    def test_of_three_rows_none_is_far_from_the_rest(self, tiny_store, tmp_path, plant):
-        path = tiny_store(tmp_path, episodes=1, ticks=9)
-        plant(path, "vl/features", lambda rows: rows.__setitem__((2, 0), rows[2, 0] * 100))
-        assert [one.kind for one in look(path).issues] == ["short episode"]
-
     def test_a_missing_view(self, path, plant):
         plant(path, "vl/frame_time", lambda shown: shown.__setitem__(slice(0, ROWS), np.nan))
         (issue,) = look(path).issues
@@ -247,88 +203,22 @@ class TestIssues:
             "view View1",
         )
 
-    def test_old_frames_and_frames_from_the_future(self, path, plant):
-        def shift(shown: np.ndarray) -> None:
-            shown[:ROWS] -= 1
-            shown[ROWS : 2 * ROWS] += 0.05
+    def test_old_frames(self, path, plant):
+        plant(path, "vl/frame_time", lambda shown: np.subtract(shown[:ROWS], 1, out=shown[:ROWS]))
+        (issue,) = look(path).issues
+        assert (issue.kind, issue.episode) == ("old frames", "episode_000")
+        assert "up to 1." in issue.message and "over 0.60 s" in issue.message
 
-        plant(path, "vl/frame_time", shift)
-        assert kinds(look(path)) == [
-            ("old frames", "left", "episode_000"),
-            ("frames from the future", "right", "episode_001"),
-        ]
-
-    def test_ticks_that_skip(self, path, plant):
-        plant(path, "tick/time", lambda time: np.add(time[5:30], 10, out=time[5:30]))
-        (issue,) = [one for one in look(path).issues if one.kind == "gap"]
-        assert (issue.start_s, issue.stop_s) == pytest.approx((0.4, 10.5))
-
-    def test_an_episode_with_another_instruction_or_none(self, tiny_store, tmp_path, plant):
+    def test_an_episode_without_an_instruction(self, tiny_store, tmp_path, plant):
         path = tiny_store(tmp_path, episodes=12)
 
-        def say(text: np.ndarray, episode: int, words: bytes) -> None:
-            start = FeatureStore.open(path).array("episode/text_start")[episode]
-            found = text.tobytes().index(b"touch the dot", start)
-            text[found : found + 13] = np.frombuffer(words.ljust(13), np.uint8)
+        def erase(text: np.ndarray) -> None:
+            start = FeatureStore.open(path).array("episode/text_start")[4]
+            at = text.tobytes().index(b"touch the dot", start)
+            text[at : at + 13] = ord(" ")
 
-        plant(path, "episode/text", lambda text: (say(text, 3, b"lift the cup"), say(text, 4, b"")))
-        assert kinds(look(path)) == [
-            ("other instruction", "right", "episode_003"),
-            ("no instruction", "left", "episode_004"),
-        ]
-
-    def test_as_many_instructions_as_episodes_take_no_time(self):
-        none = range(0)
-        nothing = {"ticks": none, "vl_rows": none, "readings": none, "states": none}
-        told = {"path": "", "format": "raw", "content": "", "digest": ""}
-        episodes = [
-            EpisodeCoverage(
-                Episode(n, str(n), "a", instruction=f"do {n}", **told, **nothing), 0, {}
-            )
-            for n in range(20_000)
-        ]
-        store: Any = SimpleNamespace(array=lambda name: np.empty(0))
-        begin = time.process_time()
-        found = {one.kind for one in find_episode_issues(store, episodes)}
-        assert time.process_time() - begin < 4
-        assert found == {"short episode"}
-
-    def test_a_flat_channel(self, path, plant):
-        plant(path, "tick/action", lambda action: action.__setitem__((slice(None), 1), 0))
-        (issue,) = look(path).issues
-        assert (issue.kind, issue.stream, issue.message[:2]) == ("flat channel", "action", "dy")
-
-    @pytest.mark.parametrize("unit", ["", "rad/s"])
-    @pytest.mark.parametrize("scale", [0, 1e-3])
-    def test_a_joint_that_hardly_moves_is_told_once(self, path, plant, unit, scale):
-        """As of recordings, whose rule it is; one that never moves is flat."""
-        attributes(path, lambda attrs: attrs["streams"]["state"].update(units=4 * [unit]))
-        assert look(path).issues == ()
-        plant(path, "state/values", lambda state: np.multiply(state[:, 2], scale, out=state[:, 2]))
-        (issue,) = look(path).issues
-        kind = "still channel" if scale else "flat channel"
-        assert (issue.kind, issue.severity, issue.stream) == (kind, "warning", "state")
-        assert issue.message.startswith("joint_2")
-
-    def test_channels_that_are_neither_of_one_unit_nor_of_one_kind_are_not_compared(
-        self, path, plant
-    ):
-        said = {"names": ["x", "y", "z", "other"], "units": 4 * [""]}
-        attributes(path, lambda attrs: attrs["streams"]["state"].update(said))
-        plant(path, "state/values", lambda state: np.multiply(state[:, 2], 1e-3, out=state[:, 2]))
-        assert look(path).issues == ()
-
-    def test_a_channel_with_what_is_no_number(self, path, plant):
-        plant(path, "state/values", lambda state: state.__setitem__((5, 1), np.nan))
-        (issue,) = look(path).issues
-        assert (issue.kind, issue.severity, issue.stream) == ("not finite", "error", "state")
-        assert issue.message.startswith("joint_1: ")
-
-    def test_short_episodes(self, tiny_store, tmp_path):
-        view = look(tiny_store(tmp_path, ticks=6, episodes=2))
-        assert [one.kind for one in view.issues if one.kind == "short episode"] == 2 * [
-            "short episode"
-        ]
+        plant(path, "episode/text", erase)
+        assert kinds(look(path)) == [("no instruction", "left", "episode_004")]
 
     @pytest.mark.parametrize(("dtype", "value"), [("float32", np.inf), ("bfloat16", 0x7FC0)])
     def test_a_row_that_is_not_finite_is_an_error_and_left_out(
@@ -345,7 +235,6 @@ class TestIssues:
             "right",
             "episode_003",
         )
-        assert issue.start_s == issue.stop_s == pytest.approx(1.2)
         assert view.features.names[2] in issue.message
         expected = sound.features.norm.copy()
         expected[34, 2] = np.nan
@@ -369,7 +258,144 @@ def test_one_slot_at_a_time_is_in_memory(tiny_store, tmp_path):
     whole = store.array("vl/features").nbytes
     assert whole > 9e6
     tracemalloc.start()
-    look_at_features(store, sample_rows(store, 200))
+    measure_features(store, np.arange(200))
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert peak < whole / 3
+
+
+@pytest.fixture(scope="module")
+def doubled(tiny_store, reseal, tmp_path_factory) -> StoreView:
+    """A store in which an episode is there twice."""
+    path = tiny_store(tmp_path_factory.mktemp("store"), sensor_channels=40)
+    like = FeatureStore.open(path).array("vl/key")
+    keys = np.memmap(path / "vl/key/c/0/0", like.dtype, "r+", shape=like.shape)
+    keys[4 * ROWS : 5 * ROWS] = keys[ROWS : 2 * ROWS]
+    reseal(path)
+    return inspect_store(path, InspectParams())
+
+
+@pytest.fixture(scope="module")
+def report(doubled) -> Report:
+    return store_report(doubled)
+
+
+def blocks(report: Report, title: str) -> list:
+    return list(next(one for one in report.sections if one.title == title).blocks)
+
+
+def test_the_sum_of_the_sources_is_the_store(report, doubled):
+    table = blocks(report, "Coverage")[0]
+    assert [row[0] for row in table.rows] == ["left", "right"]
+    own = [part.episode for part in doubled.episodes]
+    seconds = sum(part.seconds for part in doubled.episodes)
+    kinds = ("ticks", "vl_rows", "readings", "states")
+    whole = [len(own), seconds, *(sum(len(getattr(one, kind)) for one in own) for kind in kinds)]
+    sums = [sum(row[column] for row in table.rows) for column in range(3, len(table.columns))]
+    assert sums == pytest.approx(whole, abs=0.1)
+    assert sums[2] == doubled.store.ticks
+    assert dict(report.tiles)["ticks"] == f"{doubled.store.ticks}"
+
+
+@pytest.mark.parametrize(
+    ("hz", "reuse", "said"),
+    [
+        (10.0, 3, "Ticks at 10 Hz, features of the model (a VL row) at one in 3; feature spec"),
+        (None, 1, "Ticks as recorded, features of the model (a VL row) at each of them; feature"),
+    ],
+)
+def test_the_summary_says_what_a_row_is(doubled, hz, reuse, said):
+    attrs = {**doubled.store.attrs, "action_hz": hz, "vlm_reuse_count": reuse}
+    store = FeatureStore(
+        doubled.store.path, attrs, {"tick/time": np.empty(0), "vl/time": np.empty(0)}
+    )
+    summary = store_report(replace(doubled, store=store)).summary
+    assert summary.startswith(said)
+
+
+def test_what_looks_wrong_is_named_with_its_episode(report):
+    issues, checked = blocks(report, "What looks wrong")
+    assert isinstance(issues, Issues)
+    assert "all 60 VL rows give the checksums" in checked.words
+    assert "python -m stages.verify --set verify.store=" in checked.words
+    (issue,) = issues.issues
+    assert (issue.kind, issue.episode) == ("same recording", "episode_004")
+    assert "right/episode_001" in issue.message
+    words = blocks(report, "Reuse of the features")[-1]
+    assert "20 of 60 VL rows" in words.words
+
+
+def test_rows_that_are_not_finite_are_said_to_be_left_out(doubled):
+    def words(broken, norm):
+        features = replace(doubled.features, broken=broken, norm=norm)
+        return blocks(store_report(replace(doubled, features=features)), "Features")
+
+    norm = doubled.features.norm
+    first, _ = words(np.arange(len(norm))[:, None] == 34, norm)
+    assert "all VL rows, without what is not finite in 1 of them" in first.words
+    (only,) = words(np.ones(norm.shape, np.bool_), np.full_like(norm, np.nan))
+    assert only.words.endswith("none has finite features.")
+
+
+def test_the_spec_is_there_whole(report, doubled):
+    first = blocks(report, "What it was made of")[0]
+    assert isinstance(first, Outline)
+    assert json.dumps(first.content) == json.dumps(doubled.store.spec)
+
+
+def test_the_page_loads(report, tmp_path, assert_page_is_sound):
+    page, *pictures = write_report(tmp_path / "page", report)
+    assert {one.stem for one in pictures} >= {"norms"}
+    assert_page_is_sound(page)
+
+
+def test_an_episode_says_what_its_ticks_do_not_see(doubled):
+    first, *others = doubled.episodes
+    covered = {**first.covered, "sensor": 0.0, "View1": 0.999}
+    odd = replace(doubled, episodes=(replace(first, covered=covered), *others))
+    table = blocks(store_report(odd), "Coverage")[-1]
+    assert [row[-1] for row in table.rows[:2]] == ["no sensor, 99% View1", "all"]
+
+
+@pytest.fixture(scope="module")
+def flawed(tiny_store, reseal, tmp_path_factory) -> StoreView:
+    """Episode 0 has no view, and one feature is huge."""
+    path: Path = tiny_store(tmp_path_factory.mktemp("flawed"), sensor_channels=40, slots=24)
+    store = FeatureStore.open(path)
+
+    def file(name: str) -> np.ndarray:
+        like = store.array(name)
+        chunk = path / name / "c" / "/".join("0" * like.ndim)
+        return np.memmap(chunk, like.dtype, "r+", shape=like.shape)
+
+    file("vl/features")[33, 2] *= 50
+    file("vl/frame_time")[:ROWS] = np.nan
+    reseal(path)
+    return inspect_store(path, InspectParams())
+
+
+@pytest.fixture(scope="module")
+def smallest(tiny_store, tmp_path_factory) -> StoreView:
+    """One episode of one tick, no sensor and no state."""
+    folder = tmp_path_factory.mktemp("smallest")
+    sizes = {"slots": 1, "sensor_channels": 0, "state_dim": 0}
+    return inspect_store(tiny_store(folder, episodes=1, ticks=1, **sizes), InspectParams())
+
+
+def test_every_picture_is_drawn(flawed, tmp_path):
+    (path,) = write(tmp_path, {"norms.png": lambda: draw_norms(flawed.features, flawed.episodes)})
+    assert path.stat().st_size > 5000
+
+
+def test_the_smallest_store_can_be_drawn(smallest, tmp_path):
+    (path,) = write(
+        tmp_path, {"norms.png": lambda: draw_norms(smallest.features, smallest.episodes)}
+    )
+    assert mpl_image.imread(path)[..., :3].std() > 0.01  # more than a blank sheet
+
+
+def test_sources_are_parted_on_a_map_that_stays_light_on_a_dark_page(flawed):
+    """A page draws ink in white where it is dark, and the map's middle is nearly white."""
+    _, by_episode, _ = draw_norms(flawed.features, flawed.episodes).axes
+    assert by_episode.lines
+    assert INK not in {line.get_color() for line in by_episode.lines}

@@ -7,9 +7,9 @@ import pytest
 
 from pipeline.base.config import Params, load_params
 from pipeline.base.errors import ConfigError, RecordingError
-from pipeline.look.recording.subject import subject_of
+from pipeline.look.subject import subject_of
 
-PARAMS = Path(__file__).resolve().parents[3] / "params.yaml"
+PARAMS = Path(__file__).resolve().parents[2] / "params.yaml"
 
 
 def looking_at(*paths: object, output: Path | None = None) -> Params:

@@ -1,4 +1,4 @@
-"""Of a recorded run on a robot: whether a store has the features it acted on."""
+"""A recorded run of a robot beside its store: whether it has the features the robot acted on."""
 
 from pathlib import Path
 
@@ -15,15 +15,15 @@ from pipeline.store import FeatureStore
 
 
 def compare_keys(recording: str | Path, store: FeatureStore) -> str:
-    """How many VL rows of the store that was extracted from a run have a key of the robot's.
+    """How many VL rows of a run's store have a key of the robot's, and which have none.
 
-    And which have none, counted from 0, with their times since the run's first row; or, where the
-    feature specs of policy and store differ, in what.
+    Rows without are counted from 0, with their times since the run's first row. Where the feature
+    specs of policy and store differ, the text names the differences instead.
 
-    A key is a digest of feature spec, prompt and pixels: where the row's key is one that the robot
-    acted on, the store has that very feature. A row's may be missing because the model was given
-    those frames and had no time for them. Raises `StoreMismatch` where the store has not, or has
-    more than once, an episode at the recording's path, `RecordingError` where it is no run.
+    A key is a digest of feature spec, prompt and pixels: where the robot acted on the row's key,
+    the store has that very feature. A key may be missing because the model had no time for those
+    frames. Raises `StoreMismatch` where the store does not have exactly one episode at the
+    recording's path, `RecordingError` where it is no run.
     """
     root = Path(recording).resolve()
     path = sidecar(root, "features")

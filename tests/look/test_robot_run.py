@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from pipeline.base.errors import RecordingError, StoreMismatch
-from pipeline.look.recording.robot_run import compare_keys
+from pipeline.look.robot_run import compare_keys
 from pipeline.store import FeatureStore
 
 

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.jitter_picture import jitter, worst
 from pipeline.look.page.style import write
-from pipeline.look.robot.pictures import jitter, worst
 from pipeline.robot.timings import Timings
 
 

@@ -1,4 +1,4 @@
-"""The page of several evaluations side by side; it knows no recordings, as that of one does."""
+"""The page of several evaluations side by side."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -11,7 +11,7 @@ from pipeline.evaluate.baselines import BASELINES
 from pipeline.evaluate.experiments import SPANS, Experiment, best_experiment, experiment_table
 from pipeline.evaluate.figures import NO_INTERVAL
 from pipeline.evaluate.tables import FOOTNOTE
-from pipeline.look.evaluation.pictures import LABELS, STYLES, draw_bar
+from pipeline.look.evaluation import LABELS, STYLES, draw_bar
 from pipeline.look.page.blocks import Picture, Report, Section
 from pipeline.look.page.style import INK, finish, panels
 from pipeline.look.page.writing import sentence
@@ -23,7 +23,7 @@ _READING = (
 
 
 def comparison_report(experiments: Sequence[Experiment]) -> Report:
-    """The page of these experiments, of which the first are no better than the last."""
+    """The page of these experiments, in their order."""
     tables = [
         replace(
             experiment_table(experiments, span),
@@ -36,7 +36,7 @@ def comparison_report(experiments: Sequence[Experiment]) -> Report:
         "Test error of each experiment with 95 % intervals; a dot is a seed, the baselines are "
         "lines."
     )
-    picture = Picture("experiments", caption, partial(comparison_of_experiments, experiments))
+    picture = Picture("experiments", caption, partial(draw_experiments, experiments))
     tiles = []
     for span, words in SPANS.items():
         best = best_experiment(experiments, span)
@@ -56,7 +56,7 @@ def comparison_report(experiments: Sequence[Experiment]) -> Report:
     )
 
 
-def comparison_of_experiments(experiments: Sequence[Experiment]) -> Figure:
+def draw_experiments(experiments: Sequence[Experiment]) -> Figure:
     """Errors of what is executed and of the whole chunk, with intervals, seeds and baselines."""
     figure, axes = panels(11.0, 0.36 * len(experiments) + 2.8, 1, len(SPANS), sharey=True)
     for axis, (span, words) in zip(axes, SPANS.items(), strict=True):
@@ -67,7 +67,7 @@ def comparison_of_experiments(experiments: Sequence[Experiment]) -> Figure:
                 axis.plot(seeds, np.full(len(seeds), place), ls="", marker=".", ms=4, color=INK)
         for method in BASELINES:
             style = {key: STYLES[method][key] for key in ("color", "ls")}
-            value = min(one.error(span, method).value for one in experiments)
+            value = min(experiment.error(span, method).value for experiment in experiments)
             axis.axvline(value, lw=2, label=LABELS[method], **style)
         axis.set(title=words, xlabel="mean absolute error [training std]")
         axis.grid(axis="y", visible=False)

@@ -1,1 +1,0 @@
-"""The pages of an evaluation and of several beside each other."""

@@ -1,1 +1,0 @@
-"""How a robot's loop kept its deadlines."""

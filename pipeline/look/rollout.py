@@ -1,0 +1,221 @@
+"""The page of a policy's rollouts: how often it succeeds, and how it fails."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from pipeline.evaluate.rollouts import RolloutEpisode, Rollouts, controller_name
+from pipeline.look.page.blocks import Block, Outline, Picture, Report, Section, Text
+from pipeline.look.page.style import INK, PALETTE, canvas, draw_strip, finish, panels
+from pipeline.look.page.writing import sentence
+from pipeline.simulation.insertion import (
+    AT_LAYER_MM,
+    FORCE_LIMIT_N,
+    HOLD_TICKS,
+    MAX_TICKS,
+    MISS_MM,
+    OVERSHOOT_MM,
+    TICK_S,
+)
+
+_SUCCESS = (
+    f"An episode succeeds where the needle punctures within {MISS_MM:.1f} mm of the target, rests "
+    f"within {AT_LAYER_MM:g} mm of the layer for {HOLD_TICKS} ticks, never goes more than "
+    f"{OVERSHOOT_MM:g} mm beyond it, never meets more than {FORCE_LIMIT_N:g} N, and all of this "
+    f"within {MAX_TICKS * TICK_S:g} s. Anything else ends it, with its reason. The levels are "
+    "`depth`, which begins above the target, so that the sensor suffices, `full`, which begins "
+    "anywhere, and `moved`, in which target and tissue are also pushed on the way."
+)
+_CONTROLLERS = (
+    "The demonstrator is the rule that made the training data, and sees what the simulation hides. "
+    "With a stream off, the same policy sees its training mean; with one frozen, its first reading "
+    "forever. All of them meet the same episodes."
+)
+_MOMENTS = 8
+_NEAR_MM = 3.0
+"""Reach of the nearer picture of the paths, from the target."""
+_REACH = 1.3
+"""Reach of the whole picture, as a multiple of how far from the target episodes begin."""
+_WIDTH = 9.0
+_OTHER = "#999999"
+"""Colour of an episode among many."""
+_OUTCOMES = {True: ("inserted", PALETTE[0], "o"), False: ("not inserted", PALETTE[5], "X")}
+_MANY = 100
+"""Episodes from which paths are pixels in the page: thousands of lines are slow."""
+
+
+def rollout_report(rollouts: Rollouts) -> Report:
+    """The page of these rollouts, those of `policy` in detail.
+
+    The same rollouts give the same page: it names neither the time nor its own folder. Pictures ask
+    the episodes for their frames when they are drawn.
+    """
+    rates, episodes = rollouts.rates(), rollouts.of("policy")
+    shares = "; ".join(f"{controller_name(name)} {rate}" for name, rate in rates.items())
+    return Report(
+        title=f"Rollouts of {rollouts.checkpoint}",
+        summary=(
+            "The policy acts in the simulated needle insertion and sees what its actions lead to. "
+            f"Episodes that succeed at level {rollouts.level}: {shares}."
+        ),
+        tiles=[("success of the policy", str(rates["policy"]))],
+        sections=(
+            Section("Success", [Text(_SUCCESS), Text(_CONTROLLERS), rollouts.summary()]),
+            Section("Where the needle went", _paths_and_courses(rollouts)),
+            Section("Episodes closely", (), tuple(_filmstrips(episodes))),
+            Section("What was run", [Outline("Settings of the rollout", rollouts.settings)]),
+        ),
+    )
+
+
+def worst_and_median(episodes: Sequence[RolloutEpisode]) -> tuple[RolloutEpisode, RolloutEpisode]:
+    """The worst episode, and the one in the middle between it and the best.
+
+    Episodes without success are worse than those with; among equals, the farther the tip was from
+    the target and from the layer (mm, added), the worse.
+    """
+    ordered = sorted(
+        episodes, key=lambda episode: (episode.success, -episode.lateral_mm - abs(episode.depth_mm))
+    )
+    return ordered[0], ordered[len(ordered) // 2]
+
+
+def _extremes(episodes: Sequence[RolloutEpisode]) -> Mapping[str, RolloutEpisode]:
+    """The worst and the median; a single episode is only the worst."""
+    worst, median = worst_and_median(episodes)
+    return {"worst": worst} | ({} if median is worst else {"median": median})
+
+
+def _paths_and_courses(rollouts: Rollouts) -> list[Block]:
+    episodes = rollouts.of("policy")
+    above = (
+        "The path of the needle's tip as seen from the target. Points are where it punctured, or "
+        "where it ended when it never did; in the circle, an insertion may succeed. Where a push "
+        "moves the target, a line jumps. The picture cuts off what goes farther."
+    )
+    over_time = (
+        "A thin line is an episode. The tip should be near the target before it goes below the "
+        "surface, and come to rest in the green band. Force is the largest in each tick; it falls "
+        "when the needle punctures."
+    )
+    strong = {f"{kind}, seed {e.seed}": e for kind, e in _extremes(episodes).items()}
+    return [
+        Picture("paths", above, partial(draw_paths, rollouts)),
+        Picture("courses", over_time, partial(draw_courses, episodes, strong)),
+    ]
+
+
+def draw_paths(rollouts: Rollouts) -> Figure:
+    """The tip's paths from above, of policy and demonstrator; below, close to the target."""
+    shown = [name for name in ("policy", "expert") if rollouts.of(name)]
+    begins = [episode.trace.offset_mm[:1] for name in shown for episode in rollouts.of(name)]
+    far = max(_NEAR_MM, _REACH * float(np.abs(np.concatenate(begins)).max()))
+    size = _WIDTH * max(len(shown), 1.4) / 2, _WIDTH + 0.9
+    figure, axes = panels(*size, 2, len(shown), squeeze=False)
+    for column, name in zip(axes.T, shown, strict=True):
+        _draw_all(column[0], rollouts.of(name), far)
+        _draw_all(column[1], rollouts.of(name), _NEAR_MM)
+        column[0].set_title(f"{controller_name(name)}: whole paths")
+        column[1].set_title(f"{controller_name(name)}: the last {_NEAR_MM:g} mm")
+    finish(figure, axes[0, 0], 3, "Seen from above, the target in the middle")
+    return figure
+
+
+def _draw_all(axis: Axes, episodes: Sequence[RolloutEpisode], reach_mm: float) -> None:
+    """The path of each episode, from where it last comes within reach."""
+    for episode in episodes:
+        offset_mm = episode.trace.offset_mm
+        (outside,) = np.nonzero(np.abs(offset_mm).max(axis=1) > reach_mm)
+        style: dict[str, Any] = {"lw": 0.8, "alpha": 0.45, "rasterized": len(episodes) > _MANY}
+        shown = offset_mm[outside[-1] if len(outside) else 0 :]
+        axis.plot(*shown.T, color=_OUTCOMES[episode.success][1], **style)
+    around = MISS_MM * np.exp(2j * np.pi * np.arange(91) / 90)
+    label = f"{MISS_MM:g} mm from the target"
+    axis.plot(around.real, around.imag, color=INK, lw=1.6, zorder=6, label=label)
+    for outcome, (label, colour, marker) in _OUTCOMES.items():
+        ends = [episode.trace.lateral_mm for episode in episodes if episode.success == outcome]
+        style = {"s": 34, "color": colour, "edgecolors": "white", "lw": 0.6, "zorder": 7}
+        axis.scatter(*np.reshape(ends, (-1, 2)).T, marker=marker, label=label, **style)
+    axis.set(xlim=(-reach_mm, reach_mm), ylim=(-reach_mm, reach_mm), aspect="equal")
+    axis.set(xlabel="x [mm]", ylabel="y [mm]")
+
+
+def draw_courses(
+    episodes: Sequence[RolloutEpisode], strong: Mapping[str, RolloutEpisode]
+) -> Figure:
+    """Place and force over time, a thin line an episode.
+
+    `strong` are those that stand out, by their legend entry.
+    """
+    figure, axes = panels(_WIDTH, 10.0, 4)
+    pixels = len(episodes) > _MANY
+    for episode in episodes:
+        _draw_course(axes, episode, color=_OTHER, lw=0.7, alpha=0.5, rasterized=pixels)
+    for (label, episode), colour in zip(strong.items(), (PALETTE[1], INK), strict=False):
+        _draw_course(axes, episode, color=colour, lw=2.4, label=label, zorder=5)
+    _mark_limits(axes)
+    figure.align_ylabels(axes)
+    finish(
+        figure, axes[0], 2, f"Place and force over time in {len(episodes)} episode(s) of the policy"
+    )
+    return figure
+
+
+def _draw_course(axes: Sequence[Axes], episode: RolloutEpisode, **style: Any) -> None:
+    """From top to bottom: sideways from the target, height, distance to the layer, force."""
+    trace = episode.trace
+    shown = (np.hypot(*trace.offset_mm.T), trace.height_mm, trace.layer_mm, trace.force_n)
+    for axis, values in zip(axes, shown, strict=True):
+        axis.plot(trace.time_s, values, **style)
+
+
+def _mark_limits(axes: Sequence[Axes]) -> None:
+    """Titles, and the limits that an episode must keep."""
+    sideways, height, layer, force = axes
+    for axis, limit in zip(axes, (MISS_MM, 0, -OVERSHOOT_MM, FORCE_LIMIT_N), strict=True):
+        axis.axhline(limit, color=INK, lw=1, ls="--")
+        axis.tick_params(labelbottom=axis is force)
+        axis.set_xlim(axes[0].get_xlim())
+    layer.axhspan(-AT_LAYER_MM, AT_LAYER_MM, color=PALETTE[2], alpha=0.35, lw=0)
+    rest = f"green: within {AT_LAYER_MM:g}, dashed: {OVERSHOOT_MM:g} beyond it"
+    sideways.set(title=f"sideways from the target [mm]; dashed: {MISS_MM:g}", ylim=(0, None))
+    height.set_title("tip above the surface [mm]; dashed: the surface at rest")
+    layer.set_title(f"tip to the layer [mm]; {rest}")
+    force.set(title=f"force [N]; dashed: {FORCE_LIMIT_N:g}", xlabel="time [s]", ylim=(0, None))
+
+
+def _filmstrips(episodes: Sequence[RolloutEpisode]) -> Iterator[Section]:
+    caption = (
+        "What the cameras saw at moments from the beginning to the end. While the needle presses "
+        "and has not punctured, the layer gives way with it."
+    )
+    for kind, episode in _extremes(episodes).items():
+        side = "short of" if episode.depth_mm > 0 else "beyond"
+        words = (
+            f"{sentence(episode.reason)} {episode.lateral_mm:.2f} mm sideways from the target at "
+            f"the puncture, {abs(episode.depth_mm):.2f} mm {side} the layer in the end, at most "
+            f"{episode.overshoot_mm:.2f} mm beyond it and {episode.max_force_n:.2f} N, "
+            f"{episode.time_s:.1f} s."
+        )
+        title = f"{kind.capitalize()}: seed {episode.seed}, level {episode.level}"
+        draw = partial(draw_filmstrip, episode, f"{title}, {episode.reason}")
+        yield Section(title, [Text(words), Picture(f"filmstrip_{kind}", caption, draw)])
+
+
+def draw_filmstrip(episode: RolloutEpisode, title: str) -> Figure:
+    """The frames of every view at moments from beginning to end."""
+    trace = episode.trace
+    ticks = np.unique(np.linspace(0, len(trace.time_s) - 1, _MOMENTS).round().astype(int))
+    moments = trace.time_s[ticks].tolist()
+    shown = [episode.frames(moment) for moment in moments]
+    frames = {view: [images[view] for images in shown] for view in shown[0]}
+    heights = [10 / _MOMENTS * image.shape[0] / image.shape[1] for image, *_ in frames.values()]
+    figure = canvas(10.4, sum(heights) + 0.8)
+    grid = figure.add_gridspec(len(frames), _MOMENTS, height_ratios=heights)
+    draw_strip(figure, grid, frames, moments)
+    figure.suptitle(title)
+    return figure

@@ -1,1 +1,0 @@
-"""The page of a policy's rollouts: how often it succeeds, and how it fails."""

@@ -1,0 +1,452 @@
+"""A store's page: coverage, reuse and health of its features, and what it was made of.
+
+Recordings have a page of their own; here is what only a store has. A store is only read, in bounded
+memory: whole only what is a few bytes a tick or VL row, of features one slot of `inspect.points` VL
+rows at a time.
+"""
+
+import re
+from collections import defaultdict
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.colors import LinearSegmentedColormap
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+from tqdm import tqdm
+
+from pipeline.base.bfloat16 import widen
+from pipeline.base.channels import named
+from pipeline.base.commands import command
+from pipeline.base.config import InspectParams, setting
+from pipeline.base.errors import StoreIncomplete
+from pipeline.base.finite import non_finite
+from pipeline.base.format import duration, size
+from pipeline.base.issue import Issue, Severity
+from pipeline.base.table import Table
+from pipeline.look.page.blocks import Block, Issues, Outline, Picture, Report, Section, Text
+from pipeline.look.page.style import GRID, PALETTE, draw_map, panels
+from pipeline.store import FEATURES, KEY_BYTES, Episode, FeatureStore, check_trailers, episode_name
+from pipeline.store.chunks import check_row_checksums
+from pipeline.store.gather import WIDE
+from pipeline.store.repair_hints import extract_command
+from pipeline.store.schema import read_spec
+from pipeline.vlm.slots import slot_name
+
+NOTHING = "Nothing looks wrong: every check passed."
+EPISODES = 100
+"""Episodes in the table of all; of more, the first."""
+DEAD = 1e-3
+"""Spread of a slot's numbers, as a share of their size, below which it tells nothing."""
+_STILL_ROWS = 3
+"""VL rows of an episode from which its features can be still."""
+_STALE_PERIODS = 2
+"""Times the period of VL rows from which features are old."""
+_SAME_SHARE = 0.5
+"""Share of the rows of an episode, from which another with the same rows is the same recording."""
+_BLOCK_BYTES = 2**24
+_TINY = 1e-30
+_NAMED_SLOTS = 20
+_LINE = "#222222"
+"""Between sources: a map is light on a dark page too, where ink is white."""
+_AROUND = LinearSegmentedColormap.from_list("around", ("#0072B2", "#f0f0f0", "#D55E00"))
+
+
+@dataclass(frozen=True)
+class Coverage:
+    """One episode: how long it is, and which streams its ticks see."""
+
+    episode: Episode
+    seconds: float
+    """From the first tick to the last."""
+    covered: Mapping[str, float]
+    """`sensor`, `state`, and each view -> share of the episode's ticks that see it, 0 to 1."""
+
+    def issue(self, kind: str, stream: str, message: str, severity: Severity = "warning") -> Issue:
+        """An issue of this episode."""
+        return Issue(
+            severity=severity, kind=kind, message=message,
+            source=self.episode.source, episode=self.episode.id, stream=stream,
+        )  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class FeatureHealth:
+    """Length and spread of the features of some VL rows, by slot; of variants, the plain frames."""
+
+    rows: NDArray[np.int64]
+    """(row,) ascending, in the store."""
+    episode: NDArray[np.int64]
+    """(row,) index of the episode."""
+    names: tuple[str, ...]
+    """(slot,)"""
+    norm: NDArray[np.float32]
+    """(row, slot) Euclidean; NaN where the slot is invalid or not finite."""
+    variation: NDArray[np.float64]
+    """(slot,) the median over its numbers of standard deviation / root mean square: 0 = dead."""
+    within: NDArray[np.float64]
+    """(episode, slot) the same within an episode; NaN with fewer than two rows."""
+    broken: NDArray[np.bool_]
+    """(row, slot) valid, but NaN or infinite."""
+
+
+@dataclass(frozen=True, eq=False)
+class StoreView:
+    """A store and everything that its page says of it."""
+
+    store: FeatureStore
+    episodes: tuple[Coverage, ...]
+    ages: Mapping[str, NDArray[np.float32]]
+    """`newest frame` and each view -> (tick,) s since its frame was captured; NaN without one."""
+    shared_rows: int
+    """VL rows whose key another row has."""
+    features: FeatureHealth
+    bytes: int
+    """On the disk."""
+    issues: tuple[Issue, ...]
+    """Those without an episode are of the whole store."""
+
+
+def inspect_store(path: str | Path, params: InspectParams) -> StoreView:
+    """Everything that the page says of a finished store.
+
+    Checks the checksums of metadata, of every narrow array and of the `params.points` VL rows that
+    are looked at; stages.verify checks the rest. Raises `StoreIncomplete` where the store is not
+    there, unfinished, damaged or without an episode, `StoreMismatch` where it is an archive or
+    follows another schema; each says what to run.
+    """
+    store = FeatureStore.open(path)
+    check_trailers(store.path, but=tuple(WIDE.values()))
+    if not (total := len(store.array("vl/time"))):
+        raise StoreIncomplete(f"{path}: has no VL row. Run {extract_command(store.path)}.")
+    count = min(total, params.points)
+    rows = np.arange(count, dtype=np.int64) * total // count
+    _check_rows(store, rows)
+    episodes = tuple(read_coverage(store, episode) for episode in store.episodes)
+    ages, health = read_ages(store), measure_features(store, rows)
+    shared_rows, same = find_shared_rows(store, episodes)
+    issues = (
+        *find_coverage_issues(episodes),
+        *find_age_issues(store, episodes, ages["newest frame"]),
+        *find_feature_issues(health, episodes),
+        *same,
+    )
+    files = (file.stat() for file in store.path.rglob("*") if file.is_file())
+    taken = sum(status.st_blocks * 512 for status in files)
+    return StoreView(store, episodes, ages, shared_rows, health, taken, issues)
+
+
+def store_report(view: StoreView) -> Report:
+    """The page of a store; the same store gives the same page."""
+    store, episodes = view.store, view.episodes
+    rate = "as recorded" if store.action_hz is None else f"at {store.action_hz:g} Hz"
+    reuse = store.vlm_reuse_count
+    often = "each of them" if reuse == 1 else f"one in {reuse}"
+    total = len(store.array("vl/time"))
+    return Report(
+        title=f"Store: {store.path.name}",
+        summary=(
+            f"Ticks {rate}, features of the model (a VL row) at {often}; feature spec "
+            f"`{store.spec['digest']}`."
+        ),
+        tiles=[
+            ("episodes", f"{len(episodes):,}"),
+            ("length", duration(sum(episode.seconds for episode in episodes))),
+            ("ticks", f"{store.ticks:,}"),
+            ("VL rows", f"{total:,}"),
+            ("on the disk", size(view.bytes)),
+            ("findings", f"{len(view.issues):,}"),
+        ],
+        sections=(
+            Section("What looks wrong", [Issues(view.issues, NOTHING), _checked(view, total)]),
+            Section("Coverage", [_source_table(episodes), _episode_table(episodes)]),
+            Section("Reuse of the features", _reuse_blocks(view, total)),
+            Section("Features", _feature_blocks(view, total)),
+            Section(
+                "What it was made of",
+                [
+                    Outline("Feature spec", store.spec),
+                    Outline(
+                        "Computed with", {"environments of VL rows": store.attrs["environment"]}
+                    ),
+                ],
+            ),
+        ),
+    )
+
+
+def _checked(view: StoreView, total: int) -> Text:
+    count = len(view.features.rows)
+    which = f"all {total:,}" if count == total else f"{count:,} of {total:,}"
+    verify = command("verify", setting("verify.store", view.store.path))
+    words = f"Metadata, clocks, offsets and the features of {which} VL rows give the checksums"
+    return Text(f"{words} that were written with them; `{verify}` reads every byte.")
+
+
+def read_coverage(store: FeatureStore, episode: Episode) -> Coverage:
+    """Which streams and views the ticks of an episode see."""
+    ticks = slice(episode.ticks.start, episode.ticks.stop)
+    time = store.array("tick/time")[ticks]
+    seen = {
+        "sensor": store.array("tick/sensor_end")[ticks] > episode.readings.start,
+        "state": store.array("tick/state_end")[ticks] > episode.states.start,
+    }
+    shown = np.isfinite(store.array("vl/frame_time")[store.array("tick/vl_row")[ticks]])
+    seen |= dict(zip(store.streams["views"], shown.T, strict=True))
+    if not len(time):
+        return Coverage(episode, 0.0, dict.fromkeys(seen, 0.0))
+    covered = {name: float(there.mean()) for name, there in seen.items()}
+    return Coverage(episode, float(np.ptp(time)), covered)
+
+
+def _source_table(episodes: Sequence[Coverage]) -> Table:
+    """A row a source."""
+    parts: dict[str, list[Coverage]] = defaultdict(list)
+    for part in episodes:
+        parts[part.episode.source].append(part)
+    rows: list[tuple[object, ...]] = []
+    for name, part in parts.items():
+        own = [coverage.episode for coverage in part]
+        seconds = round(sum(coverage.seconds for coverage in part), 1)
+        kinds = ("ticks", "vl_rows", "readings", "states")
+        counts = [sum(len(getattr(episode, kind)) for episode in own) for kind in kinds]
+        formats = ", ".join(sorted({episode.format for episode in own}))
+        instructions = len({episode.instruction for episode in own})
+        rows.append((name, formats, instructions, len(own), seconds, *counts))
+    heads = ("source", "format", "instructions", "episodes", "length [s]", "ticks", "VL rows")
+    return Table((*heads, "sensor readings", "state readings"), rows)
+
+
+def _episode_table(episodes: Sequence[Coverage]) -> Table:
+    """A row an episode."""
+    caption = "Ticks see all streams and views, none of one (no …), or one in a share of them."
+    if len(episodes) > EPISODES:
+        caption += f" The first {EPISODES} of {len(episodes)} episodes."
+    heads = ("source", "episode", "instruction", "ticks", "length [s]", "VL rows", "ticks see")
+    rows: list[tuple[object, ...]] = []
+    for part in episodes[:EPISODES]:
+        own = part.episode
+        counts = len(own.ticks), round(part.seconds, 2), len(own.vl_rows)
+        lacking = [
+            # A partial share is never rounded to all or none.
+            f"{min(max(share, 0.01), 0.99):.0%} {name}" if share else f"no {name}"
+            for name, share in part.covered.items()
+            if share < 1
+        ]
+        rows.append((own.source, own.id, own.instruction, *counts, ", ".join(lacking) or "all"))
+    return Table(heads, rows, caption)
+
+
+def find_coverage_issues(episodes: Sequence[Coverage]) -> Iterator[Issue]:
+    """Streams and views that an episode lacks and others have, and missing instructions."""
+    there = {name for part in episodes for name, share in part.covered.items() if share}
+    for part in episodes:
+        # An episode without a tick has no stream to miss.
+        for name, share in part.covered.items() if len(part.episode.ticks) else ():
+            stream = name if name in ("sensor", "state") else f"view {name}"
+            if name in there and not share:
+                yield part.issue("missing", stream, "no tick sees it; other episodes have it")
+            elif 0 < share < 1:
+                yield part.issue("partly missing", stream, f"only {share:.0%} of the ticks see it")
+        if not part.episode.instruction.strip():
+            message = "the prompt names no task; set `instruction` of its data source"
+            yield part.issue("no instruction", "instruction", message)
+
+
+def read_ages(store: FeatureStore) -> dict[str, NDArray[np.float32]]:
+    """`newest frame` and each view -> (tick,) age in s: time of the tick less that of the frame."""
+    shown = store.array("vl/frame_time")[store.array("tick/vl_row")]
+    ages = (store.array("tick/time")[:, None] - shown).astype(np.float32)
+    newest = store.feature_age(np.arange(store.ticks)).astype(np.float32)
+    return {"newest frame": newest} | dict(zip(store.streams["views"], ages.T, strict=True))
+
+
+def find_age_issues(
+    store: FeatureStore, episodes: Sequence[Coverage], ages: NDArray[np.float32]
+) -> Iterator[Issue]:
+    """Episodes whose ticks use features far older than a VL row serves; `ages` are (tick,) s."""
+    limit_s = _STALE_PERIODS * store.vlm_reuse_count * store.tick_step()
+    for part in episodes:
+        own = ages[part.episode.ticks.start : part.episode.ticks.stop]
+        if old := int(np.count_nonzero(own > limit_s)):
+            message = f"{old} of {len(own)} ticks see features up to {own.max():.2f} s old, over "
+            message += f"{limit_s:.2f} s, the time of {_STALE_PERIODS} VL rows"
+            yield part.issue("old frames", "vl/frame_time", message)
+
+
+def find_shared_rows(store: FeatureStore, episodes: Sequence[Coverage]) -> tuple[int, list[Issue]]:
+    """How many VL rows have the key of another, and an issue for episodes with the same rows.
+
+    Equal keys are equal frames, prompt and feature spec.
+    """
+    keys = np.ascontiguousarray(store.array("vl/key")).view(f"V{KEY_BYTES}").ravel()
+    _, key, counts = np.unique(keys, return_inverse=True, return_counts=True)
+    lengths = np.diff(store.array("episode/vl_start"))
+    owner = np.repeat(np.arange(len(lengths)), lengths)
+    first = np.full(len(counts), len(lengths))
+    np.minimum.at(first, key, owner)
+    later = first[key] < owner
+    pairs, shared = np.unique(
+        np.column_stack([first[key], owner])[later], axis=0, return_counts=True
+    )
+    issues: list[Issue] = []
+    for (a, b), count in zip(pairs.tolist(), shared.tolist(), strict=True):
+        if count >= _SAME_SHARE * min(lengths[a], lengths[b]):
+            message = f"{count} of its {lengths[b]} VL rows have exactly the frames and prompt of "
+            message += f"rows of {episode_name(episodes[a].episode)}"
+            issues.append(episodes[b].issue("same recording", "vl/key", message))
+    return int((counts[key] > 1).sum()), issues
+
+
+def _reuse_blocks(view: StoreView, total: int) -> list[Block]:
+    """Ages of the features, and how many rows are there twice."""
+    rows = [
+        (name, *np.nanquantile(age, (0.01, 0.5, 0.99, 1.0)).tolist())
+        for name, age in view.ages.items()
+        if np.isfinite(age).any()
+    ]
+    variants = view.store.variants
+    augmented = f" Each is there {variants} times: plain and augmented." if variants > 1 else ""
+    return [
+        Text("The policy is given the age of the newest frame as `feature_age`."),
+        Table(("age [s] of", "1 %", "median", "99 %", "oldest"), rows),
+        Text(
+            f"{view.shared_rows:,} of {total:,} VL rows have exactly the frames and prompt of "
+            f"another row.{augmented}"
+        ),
+    ]
+
+
+def _check_rows(store: FeatureStore, rows: NDArray[np.int64]) -> None:
+    """Raise `StoreIncomplete` where one of these VL rows does not give its checksum."""
+    features, checksums = store.array(FEATURES), store.array("vl/checksum")
+    spec = read_spec(store.path, FEATURES)
+    for block in np.array_split(rows, max(1, len(rows) * features[:1].nbytes // _BLOCK_BYTES)):
+        check_row_checksums(store.path, spec, block, features[block], checksums[block])
+
+
+def measure_features(store: FeatureStore, rows: NDArray[np.int64]) -> FeatureHealth:
+    """Norms and variation of these rows, slot after slot."""
+    count, slots = len(rows), store.feature_shape[0]
+    episode = np.searchsorted(store.array("episode/vl_start"), rows, side="right") - 1
+    norm = np.full((count, slots), np.nan, np.float32)
+    variation = np.full(slots, np.nan)
+    within = np.full((len(store.episodes), slots), np.nan)
+    broken = np.zeros((count, slots), np.bool_)
+    for slot in tqdm(range(slots), desc="look at features", unit="slot", disable=None):
+        values = read_slot(store, rows, slot)
+        valid = store.array("vl/slot_valid")[rows, slot] != 0
+        broken[:, slot] = valid & non_finite(values).any(axis=1)
+        valid &= ~broken[:, slot]
+        norm[valid, slot] = np.linalg.norm(values[valid], axis=1)
+        variation[slot] = _variation(values[valid])
+        for index in np.unique(episode[valid]):
+            within[index, slot] = _variation(values[valid & (episode == index)])
+    # Variants repeat the names.
+    names = tuple(slot_name(document) for document in store.attrs["slots"][:slots])
+    return FeatureHealth(rows, episode, names, norm, variation, within, broken)
+
+
+def read_slot(store: FeatureStore, rows: NDArray[np.int64], slot: int) -> NDArray[np.float32]:
+    """(row, dim) of one slot of the plain frames, whatever dtype it is stored in."""
+    return widen(store.array(FEATURES)[rows, slot]).astype(np.float32, copy=False)
+
+
+def _variation(values: NDArray[np.float32]) -> float:
+    """The median over numbers of spread / size: huge constant numbers do not hide the others."""
+    if len(values) < 2:
+        return np.nan
+    spread = values.std(axis=0, dtype=np.float64)
+    size = np.sqrt(spread**2 + values.mean(axis=0, dtype=np.float64) ** 2)
+    return float(np.median(spread / np.maximum(size, _TINY)))
+
+
+def find_feature_issues(health: FeatureHealth, episodes: Sequence[Coverage]) -> Iterator[Issue]:
+    """Dead slots, features that stand still in an episode, and features that are not finite."""
+    if dead := np.flatnonzero(health.variation < DEAD).tolist():
+        message = f"{named(health.names, dead)}: the same in all VL rows looked at"
+        yield Issue(severity="warning", kind="dead slot", message=message, stream=FEATURES)
+    still = (health.within < DEAD) & (health.variation >= DEAD)
+    for index, part in enumerate(episodes):
+        own = health.episode == index
+        if len(row := np.nonzero(health.broken[own])[0]):
+            slot = health.broken[own][row[0]].argmax()
+            message = f"{len(np.unique(row))} VL row(s) are NaN or infinite, the first in slot "
+            message += f"{health.names[slot]}; training refuses them: extract them anew"
+            yield part.issue("not finite", FEATURES, message, severity="error")
+        if own.sum() >= _STILL_ROWS and still[index].any():
+            slots = named(health.names, np.flatnonzero(still[index]).tolist())
+            message = f"{slots}: the same in all {own.sum()} VL rows looked at of this episode"
+            yield part.issue("still features", FEATURES, message)
+
+
+def _feature_blocks(view: StoreView, total: int) -> list[Block]:
+    """Which rows were looked at, and the picture of their norms."""
+    health = view.features
+    words = "Looked at: all VL rows"
+    if len(health.rows) < total:
+        words = f"Looked at: {len(health.rows):,} of {total:,} VL rows (`inspect.points`)"
+    if broken := int(health.broken.any(axis=1).sum()):
+        words += f", without what is not finite in {broken:,} of them"
+    if not np.isfinite(health.norm).any():
+        return [Text(f"{words}; none has finite features.")]
+    caption = "Norm of the features by slot, and the median in each episode / in all."
+    picture = Picture("norms", caption, partial(draw_norms, health, view.episodes))
+    return [Text(f"{words}. Of augmented variants, plain frames only."), picture]
+
+
+def draw_norms(health: FeatureHealth, episodes: Sequence[Coverage]) -> Figure:
+    """Norms of the features: by slot on the left, by slot and episode on the right."""
+    slots = len(health.names)
+    figure, (left, right) = panels(
+        9.5, 3.0 + min(5.0, 0.3 * slots), 1, 2, sharey=True, width_ratios=(1, 1.7)
+    )
+    at = np.arange(slots)
+    low, middle, high = _quantiles(health.norm, (0.01, 0.5, 0.99))
+    left.hlines(at, low, high, color=PALETTE[4], lw=min(5.0, 160 / slots), label="1 to 99 %")
+    left.plot(middle, at, "o", color=PALETTE[0], ms=min(5.0, 120 / slots), label="median")
+    left.set_xlabel("norm of the features")
+    left.set_ylim(slots - 0.5, -0.5)
+    # Of many slots, the first of those that differ in their cell only.
+    stems = (
+        health.names
+        if slots <= _NAMED_SLOTS
+        else [re.sub(r" \d+,\d+$", "", n) for n in health.names]
+    )
+    first = [number for number in range(slots) if stems[number] not in stems[:number]]
+    left.set_yticks(first, [stems[number] for number in first])
+    ratio = np.full((slots, len(episodes)), np.nan)
+    for index in np.unique(health.episode):
+        (median,) = _quantiles(health.norm[health.episode == index], (0.5,))
+        ratio[:, index] = median / middle
+    most = max(0.02, *np.abs(ratio[np.isfinite(ratio)] - 1))
+    right.set_facecolor(GRID)
+    image = draw_map(right, ratio, (1 - most, 1 + most), _AROUND, numbered=False)
+    right.tick_params(left=False)
+    _mark_sources(right, [part.episode.source for part in episodes])
+    figure.colorbar(image, ax=right, label="median in the episode / in all", pad=0.02)
+    figure.legend(*left.get_legend_handles_labels(), loc="outside lower left", ncols=2)
+    return figure
+
+
+def _quantiles(norm: NDArray[np.float32], shares: Sequence[float]) -> NDArray[np.float64]:
+    """(share, slot) over the rows where it is finite; NaN where it never is."""
+    out = np.full((len(shares), norm.shape[1]), np.nan)
+    there = np.isfinite(norm).any(axis=0)
+    out[:, there] = np.nanquantile(norm[:, there], shares, axis=0)
+    return out
+
+
+def _mark_sources(axis: Axes, sources: Sequence[str]) -> None:
+    """Sources and how many episodes they have below an axis of episodes, parted by lines."""
+    starts = [at for at, source in enumerate(sources) if not at or source != sources[at - 1]]
+    for start in starts[1:]:
+        axis.axvline(start - 0.5, color=_LINE, lw=1.0)
+    counts = np.diff([*starts, len(sources)])
+    labels = [f"{sources[start]}\n{count}" for start, count in zip(starts, counts, strict=True)]
+    axis.set_xticks(starts + (counts - 1) / 2, labels)
+    axis.set_xlabel("episodes, by source")

@@ -1,1 +1,0 @@
-"""Stores: what they hold, what looks wrong, and their page."""
