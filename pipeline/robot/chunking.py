@@ -1,6 +1,6 @@
 """Action chunks played one step a tick: what of a plan is due, averaged, or left to continue.
 
-Numpy only; `pipeline.robot.guides` makes tensors of guides.
+Numpy only; `pipeline.robot.session.stack_guides` makes tensors of guides.
 """
 
 from collections import deque

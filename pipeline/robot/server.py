@@ -1,8 +1,8 @@
-"""The policy server: openpi's protocol over a websocket, and a page that shows how it goes.
+"""The policy server: openpi's protocol over a websocket; beside it `/healthz`, `/status.json`.
 
-A connection is one robot: it gets the metadata, then an answer to each observation, in order. What
-is wrong with a message costs its connection only. One line of text says what went wrong, before the
-connection is closed: `refused: …`, `error: …`; after `busy: …` it stays open.
+A connection is one robot: it gets the metadata, then an answer to each observation, in order. A
+wrong message costs its own connection only: one line of text says why, `refused: …` or `error: …`,
+and the connection is closed. After `busy: …` it stays open.
 """
 
 import asyncio
@@ -15,7 +15,7 @@ import socket
 import sys
 import threading
 import traceback
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, suppress
 from functools import partial
@@ -34,17 +34,16 @@ from pipeline.base.errors import ConfigError, ObservationError, PipelineError, W
 from pipeline.robot import wire
 from pipeline.robot.client import TOKEN_VARIABLE
 from pipeline.robot.session import ServedPolicy, Session
-from pipeline.robot.status import ConnectedRobot, ServerStatus, page
+from pipeline.robot.status import ConnectedRobot, ServerStatus
 
 CLOSING_S: Final = 30.0
-"""How long an observation under way may keep the server from closing."""
-_SHARED: Final = {"Cache-Control": "no-store", "X-Content-Type-Options": "nosniff"}
+"""How long an unanswered observation may keep the server from closing."""
 
 
 def read_token(params: ServeParams) -> str | None:
-    """The token of `serve.token_file`, else of the environment, else none.
+    """The token of `serve.token_file`, else of the environment, else None.
 
-    Raises `ConfigError` for an empty one, and where the host asks for one and there is none.
+    Raises `ConfigError` for an empty token, and for a host that needs one without one.
     """
     token, file = os.environ.get(TOKEN_VARIABLE), params.token_file
     try:
@@ -71,7 +70,7 @@ def read_token(params: ServeParams) -> str | None:
 def listen(params: ServeParams) -> socket.socket:
     """A socket at `serve.host` and `serve.port`, not yet listening.
 
-    Raises `ConfigError` where the address is not this machine's, or is taken.
+    Raises `ConfigError` where the address is not of this machine, or is taken.
     """
     with ExitStack() as undo:
         try:
@@ -100,13 +99,13 @@ class PolicyServer:
         bound: socket.socket,
         say: Callable[[str], None] = lambda line: None,
     ) -> None:
-        """`bound` is what `listen` gave, `token` what `read_token` did."""
+        """`bound` comes from `listen`, `token` from `read_token`."""
         self._served, self._params, self._token, self._say = served, params, token, say
         self._socket = bound
         host, port = bound.getsockname()[:2]
         self.address = f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
         self.status = ServerStatus(served.metadata)
-        # A thread a robot, for each has at most one observation under way.
+        # One thread a robot, which has at most one unanswered observation.
         self._threads = ThreadPoolExecutor(params.max_connections, "robot")
         self._answering = 0
         self._idle: set[ServerConnection] = set()
@@ -114,15 +113,15 @@ class PolicyServer:
         self._stop: Callable[[], object] = lambda: None
 
     def run(self, started: Callable[[], None] = lambda: None) -> bool:
-        """Serve; whether a signal ended it. `started` is called once connections are taken."""
+        """Serve, and call `started` once robots can connect; whether a signal ended it."""
         try:
             return asyncio.run(self._run(started))
         finally:
             self._threads.shutdown()
 
     def stop(self) -> None:
-        """Have `run` end, from any thread, once it has begun: what is under way is answered."""
-        with suppress(RuntimeError):  # it has ended
+        """End `run` from any thread, once it has begun; observations that came are answered."""
+        with suppress(RuntimeError):  # it has ended already
             self._stop()
 
     async def _run(self, started: Callable[[], None]) -> bool:
@@ -131,7 +130,7 @@ class PolicyServer:
         if threading.current_thread() is threading.main_thread():
             for number in (signal.SIGINT, signal.SIGTERM):
                 loop.add_signal_handler(number, signalled.put_nowait, True)
-        # Handshakes of strangers that fail are no news.
+        # Failed handshakes of strangers are not logged.
         quiet = logging.getLogger(f"{__name__}.websockets")
         quiet.setLevel(logging.CRITICAL + 1)
         server = await serve(
@@ -151,7 +150,7 @@ class PolicyServer:
         return by_signal
 
     async def _close(self, server: Server) -> None:
-        """No new connections, an answer to each observation under way, then 1001."""
+        """Refuse new connections, answer the observations that came, then close with 1001."""
         self._stopping = True
         server.close(close_connections=False)
         await asyncio.gather(*(_leave(connection) for connection in self._idle))
@@ -170,9 +169,9 @@ class PolicyServer:
             code = None
             while code is None and not self._stopping:
                 message = await self._next(connection)
-                said, code = await self._answer(robot, message, session)
+                answer, code = await self._answer(robot, message, session)
                 del message
-                await connection.send(said)
+                await connection.send(answer)
             if code is None:
                 await _leave(connection)
             else:
@@ -180,7 +179,7 @@ class PolicyServer:
                 await connection.close(code)
 
     async def _next(self, connection: ServerConnection) -> str | bytes:
-        """The next message; closes a connection from which none comes."""
+        """The next message; closes a connection that sends none."""
         self._idle.add(connection)
         try:
             async with asyncio.timeout(self._params.idle_s):
@@ -195,15 +194,15 @@ class PolicyServer:
     async def _answer(
         self, robot: ConnectedRobot, message: str | bytes, session: Session
     ) -> tuple[str | bytes, int | None]:
-        """What is said to a message, and the code to close the connection with, None to go on."""
+        """The answer to a message, and the code to close the connection with; None to go on."""
         if isinstance(message, str):
-            said = "refused: expected a message of bytes (msgpack), found a text"
-            return said, CloseCode.UNSUPPORTED_DATA
+            why = "refused: expected a message of bytes (msgpack), found a text"
+            return why, CloseCode.UNSUPPORTED_DATA
         loop, busy = asyncio.get_running_loop(), self._answering >= self._params.max_waiting
-        asked = (robot, message, session, busy)
         self._answering += 1
         try:
-            return await loop.run_in_executor(self._threads, self._think, *asked), None
+            work = (self._think, robot, message, session, busy)
+            return await loop.run_in_executor(self._threads, *work), None
         except WireError as error:
             return f"refused: {_line(error)}", CloseCode.INVALID_DATA
         except ObservationError as error:
@@ -212,8 +211,8 @@ class PolicyServer:
             return f"error: {_line(error)}", CloseCode.INTERNAL_ERROR
         except Exception as error:
             traceback.print_exception(error, file=sys.stderr)
-            said = f"error: {type(error).__name__}: the server's output says more"
-            return said, CloseCode.INTERNAL_ERROR
+            why = f"error: {type(error).__name__}: the server's output says more"
+            return why, CloseCode.INTERNAL_ERROR
         finally:
             self._answering -= 1
 
@@ -234,7 +233,7 @@ class PolicyServer:
         return wire.pack(answer)
 
     async def _respond(self, connection: ServerConnection, request: Request) -> Response | None:
-        """The answer to a request by HTTP; None where it opens a websocket."""
+        """The answer to an HTTP request; None where it opens a websocket."""
         headers, say = request.headers, partial(_response, connection)
         try:
             path, foreign = urlsplit(request.path).path, self._is_foreign(headers)
@@ -243,33 +242,32 @@ class PolicyServer:
         except MultipleValuesError as error:
             return say(HTTPStatus.BAD_REQUEST, f"expected the header {error} once, found several\n")
         except ValueError as error:
-            said = f"expected addresses in the path, Host and Origin, found one without: {error}\n"
-            return say(HTTPStatus.BAD_REQUEST, said)
+            why = f"expected addresses in the path, Host and Origin, found one without: {error}\n"
+            return say(HTTPStatus.BAD_REQUEST, why)
         if path == "/healthz":
             return say(HTTPStatus.OK, "OK\n")
         if foreign:
             return say(HTTPStatus.FORBIDDEN, "pages of other places are not served\n")
-        if path == "/" and not opens:
-            return say(HTTPStatus.OK, *page())
         if not authorized:
-            said = "expected the header Authorization: Api-Key <the server's token>\n"
-            return say(HTTPStatus.UNAUTHORIZED, said, {"WWW-Authenticate": "Api-Key"})
+            why = "expected the header Authorization: Api-Key <the server's token>\n"
+            return say(HTTPStatus.UNAUTHORIZED, why, **{"WWW-Authenticate": "Api-Key"})
         if path == "/status.json":
-            text = await asyncio.to_thread(self.status.json)
-            return say(HTTPStatus.OK, text, {"Content-Type": "application/json"})
+            kind = {"Content-Type": "application/json"}
+            return say(HTTPStatus.OK, self.status.json(), **kind)
         if not opens:
-            return say(HTTPStatus.NOT_FOUND, "not here: /, /healthz, /status.json\n")
+            why = "expected a websocket at /, /healthz or /status.json\n"
+            return say(HTTPStatus.NOT_FOUND, why)
         most = self._params.max_connections
         if len(self.status.robots) < most:
             return None
-        said = f"busy: {most} robots are connected (serve.max_connections)\n"
-        return say(HTTPStatus.SERVICE_UNAVAILABLE, said)
+        why = f"busy: {most} robots are connected (serve.max_connections)\n"
+        return say(HTTPStatus.SERVICE_UNAVAILABLE, why)
 
     def _is_foreign(self, headers: Headers) -> bool:
-        """Whether a page of another place asks, which a browser on this machine would let in.
+        """Whether a web page from elsewhere asks through a browser on this machine.
 
-        Without a token that is also told by the name that the browser believes to talk to: another
-        place's name can be made to mean this machine.
+        Without a token the name in `Host` counts too, because anybody's name can be made to resolve
+        to this machine.
         """
         here = urlsplit(f"//{headers.get('Host', '')}")
         if "Origin" in headers and urlsplit(headers["Origin"]).netloc != here.netloc:
@@ -282,13 +280,11 @@ class PolicyServer:
 
 
 def _response(
-    connection: ServerConnection,
-    status: HTTPStatus,
-    text: str,
-    headers: Mapping[str, str] = _SHARED,
+    connection: ServerConnection, status: HTTPStatus, text: str, **headers: str
 ) -> Response:
     response = connection.respond(status, text)
-    for name, value in {**_SHARED, **headers}.items():
+    headers |= {"Cache-Control": "no-store", "X-Content-Type-Options": "nosniff"}
+    for name, value in headers.items():
         response.headers.pop(name, None)
         response.headers[name] = value
     return response
@@ -306,5 +302,5 @@ def _is_loopback(host: str) -> bool:
 
 
 def _line(error: Exception) -> str:
-    """What an error says, in one line that may be long."""
+    """The message of an error in one line."""
     return " ".join(str(error).split())[:2000]

@@ -6,7 +6,7 @@ import numpy as np
 
 from pipeline.look.page.style import write
 from pipeline.look.robot.pictures import jitter, worst
-from pipeline.robot.timings import Timings
+from pipeline.robot.run_report import Timings
 
 
 def run(rows: int, seed: int) -> tuple[float, Timings]:
