@@ -18,6 +18,6 @@ robot_memory.py    the newest readings and features of one robot, as a policy ta
 live_features.py   frames -> features by the policy's own model, proved by golden rows
 first_look.py      refuses exchanged views, colours, units and channels
 session.py         a served policy, and its memory of each robot
-server.py, status.py           the websocket server, and its counts and latencies
+server.py          the websocket server, and its counts and latencies
 export.py, export_inputs.py    the head as ONNX and torch.export
 """

@@ -3,7 +3,7 @@
 import math
 import time
 from collections import deque
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, get_args
@@ -32,9 +32,9 @@ class Ring:
         self.count = 0
         """Rows that were ever added."""
 
-    def note(self, row: Iterable[float] | NDArray[np.float64]) -> None:
+    def note(self, row: Sequence[float] | NDArray[np.float64]) -> None:
         """Add a row, in place of the oldest where the buffer is full."""
-        self._buffer[self.count % len(self._buffer)] = row  # pyright: ignore[reportArgumentType]
+        self._buffer[self.count % len(self._buffer)] = row
         self.count += 1
 
     def rows(self) -> NDArray[np.float64]:

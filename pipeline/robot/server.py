@@ -8,19 +8,22 @@ and the connection is closed. After `busy: …` it stays open.
 import asyncio
 import hmac
 import ipaddress
+import json
 import logging
+import math
 import os
 import signal
 import socket
 import sys
 import threading
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, suppress
 from functools import partial
 from http import HTTPStatus
-from typing import Final
+from time import monotonic
+from typing import Any, Final
 from urllib.parse import urlsplit
 
 from websockets.asyncio.server import Server, ServerConnection, serve
@@ -33,11 +36,14 @@ from pipeline.base.config import ServeParams
 from pipeline.base.errors import ConfigError, ObservationError, PipelineError, WireError
 from pipeline.robot import wire
 from pipeline.robot.client import TOKEN_VARIABLE
+from pipeline.robot.run_report import Timings
 from pipeline.robot.session import ServedPolicy, Session
-from pipeline.robot.status import ConnectedRobot, ServerStatus
 
 CLOSING_S: Final = 30.0
 """How long an unanswered observation may keep the server from closing."""
+_TIMED: Final = ("vlm_ms", "head_ms", "wait_ms", "infer_ms")
+_KEPT: Final = 5000
+"""Newest answers whose latencies are kept."""
 
 
 def read_token(params: ServeParams) -> str | None:
@@ -86,6 +92,32 @@ def listen(params: ServeParams) -> socket.socket:
             ) from None
         undo.pop_all()
         return bound
+
+
+class ServerStatus:
+    """Counts and latencies of a server's answers, and what it serves."""
+
+    def __init__(self, metadata: Mapping[str, Any]) -> None:
+        self.refused = self.busy = 0
+        told = ("checkpoint", "step", "model_type", "action_hz", "feature_spec_digest")
+        self._policy = {name: metadata[name] for name in told}
+        self._timings, self._since_s = Timings(_TIMED, _KEPT), monotonic()
+        self._lock = threading.Lock()
+
+    def answered(self, timing: Mapping[str, float]) -> None:
+        """Note the `server_timing` of an answer, from any thread; a part of 0 ms did not happen."""
+        with self._lock:
+            self._timings.note([timing[part] or math.nan for part in _TIMED])
+
+    def json(self, connected: int) -> str:
+        """The content of `/status.json`, with the number of robots that are connected."""
+        with self._lock:
+            answered, latency = self._timings.count, self._timings.document()
+        counts = {"connected": connected, "answered": answered}
+        counts |= {"refused": self.refused, "busy": self.busy}
+        seconds = monotonic() - self._since_s
+        document = {"policy": self._policy, "seconds": seconds, "counts": counts}
+        return json.dumps(document | {"latency": latency})
 
 
 class PolicyServer:
@@ -162,14 +194,13 @@ class PolicyServer:
 
     async def _converse(self, connection: ServerConnection) -> None:
         """One robot, from its metadata to its last answer."""
-        peer = str(connection.remote_address[0])
-        with self.status.connected(peer) as robot, suppress(ConnectionClosed, TimeoutError):
+        with suppress(ConnectionClosed, TimeoutError):
             await connection.send(wire.pack(self._served.metadata))
             session = self._served.session(self._params.fresh, self._params.seed)
             code = None
             while code is None and not self._stopping:
                 message = await self._next(connection)
-                answer, code = await self._answer(robot, message, session)
+                answer, code = await self._answer(message, session)
                 del message
                 await connection.send(answer)
             if code is None:
@@ -192,7 +223,7 @@ class PolicyServer:
             self._idle.discard(connection)
 
     async def _answer(
-        self, robot: ConnectedRobot, message: str | bytes, session: Session
+        self, message: str | bytes, session: Session
     ) -> tuple[str | bytes, int | None]:
         """The answer to a message, and the code to close the connection with; None to go on."""
         if isinstance(message, str):
@@ -201,7 +232,7 @@ class PolicyServer:
         loop, busy = asyncio.get_running_loop(), self._answering >= self._params.max_waiting
         self._answering += 1
         try:
-            work = (self._think, robot, message, session, busy)
+            work = (self._think, message, session, busy)
             return await loop.run_in_executor(self._threads, *work), None
         except WireError as error:
             return f"refused: {_line(error)}", CloseCode.INVALID_DATA
@@ -216,9 +247,7 @@ class PolicyServer:
         finally:
             self._answering -= 1
 
-    def _think(
-        self, robot: ConnectedRobot, message: bytes, session: Session, busy: bool
-    ) -> str | bytes:
+    def _think(self, message: bytes, session: Session, busy: bool) -> str | bytes:
         """The answer to a message, in a thread of its own."""
         observation = session.take(wire.unpack(message, self._params.max_message_mb * 2**20))
         if busy:
@@ -226,7 +255,7 @@ class PolicyServer:
             waiting = self._params.max_waiting
             return f"busy: {waiting} observations are waiting; the readings were taken"
         answer = session.answer(observation)
-        self.status.answered(robot, observation, answer)
+        self.status.answered(answer["server_timing"])
         if "feature_key" in answer:
             # Bytes, not an array: openpi's chunk broker takes every array for one of steps.
             answer["feature_key"] = answer["feature_key"].tobytes()
@@ -242,37 +271,35 @@ class PolicyServer:
         except MultipleValuesError as error:
             return say(HTTPStatus.BAD_REQUEST, f"expected the header {error} once, found several\n")
         except ValueError as error:
-            why = f"expected addresses in the path, Host and Origin, found one without: {error}\n"
+            why = f"expected addresses in the path and Host, found another: {error}\n"
             return say(HTTPStatus.BAD_REQUEST, why)
         if path == "/healthz":
             return say(HTTPStatus.OK, "OK\n")
         if foreign:
-            return say(HTTPStatus.FORBIDDEN, "pages of other places are not served\n")
+            return say(HTTPStatus.FORBIDDEN, "web pages are not served\n")
         if not authorized:
             why = "expected the header Authorization: Api-Key <the server's token>\n"
             return say(HTTPStatus.UNAUTHORIZED, why, **{"WWW-Authenticate": "Api-Key"})
+        connected, most = len(connection.server.connections), self._params.max_connections
         if path == "/status.json":
             kind = {"Content-Type": "application/json"}
-            return say(HTTPStatus.OK, self.status.json(), **kind)
+            return say(HTTPStatus.OK, self.status.json(connected), **kind)
         if not opens:
             why = "expected a websocket at /, /healthz or /status.json\n"
             return say(HTTPStatus.NOT_FOUND, why)
-        most = self._params.max_connections
-        if len(self.status.robots) < most:
+        if connected < most:
             return None
         why = f"busy: {most} robots are connected (serve.max_connections)\n"
         return say(HTTPStatus.SERVICE_UNAVAILABLE, why)
 
     def _is_foreign(self, headers: Headers) -> bool:
-        """Whether a web page from elsewhere asks through a browser on this machine.
+        """Whether a web page asks, through a browser on this machine.
 
-        Without a token the name in `Host` counts too, because anybody's name can be made to resolve
-        to this machine.
+        Browsers send `Origin` with it; or, without a token, a `Host` whose name was made to mean
+        this machine.
         """
-        here = urlsplit(f"//{headers.get('Host', '')}")
-        if "Origin" in headers and urlsplit(headers["Origin"]).netloc != here.netloc:
-            return True
-        return self._token is None and not _is_loopback(here.hostname or "")
+        host = urlsplit(f"//{headers.get('Host', '')}").hostname
+        return "Origin" in headers or (self._token is None and not _is_loopback(host or ""))
 
     def _authorized(self, headers: Headers) -> bool:
         given = headers.get("Authorization", "").encode()

@@ -20,7 +20,7 @@ from pipeline.base.config import ServeParams
 from pipeline.base.errors import ConfigError
 from pipeline.robot import wire
 from pipeline.robot.client import PolicyClient
-from pipeline.robot.server import PolicyServer, listen, read_token
+from pipeline.robot.server import PolicyServer, ServerStatus, listen, read_token
 
 Observe = Callable[..., dict[str, Any]]
 Serving = Callable[..., PolicyServer]
@@ -224,14 +224,12 @@ def test_pages_of_other_places_are_refused(served_policy: Served, serving: Servi
     for headers in (
         {"Origin": "https://example.org"},
         {"Origin": "null"},
-        {"Host": "example.org", "Origin": "http://example.org"},  # a name made to mean this machine
-        {"Host": "example.org:8000"},
+        {"Origin": f"http://{server.address}"},
+        {"Host": "example.org:8000"},  # a name made to mean this machine
     ):
         for path in ("/", "/status.json"):
             assert get(server, path, **headers)[0] == 403, headers
     with pytest.raises(InvalidStatus, match="403"), opened(server, origin="https://example.org"):
-        pass
-    with opened(server, origin=f"http://{server.address}"):
         pass
     assert [get(server, path)[0] for path in ("/", "/elsewhere")] == [404, 404]
 
@@ -241,9 +239,7 @@ def test_pages_of_other_places_are_refused(served_policy: Served, serving: Servi
     [
         ("/", ["Host: [::1"], "Invalid IPv6 URL"),
         ("//[", ["Host: localhost"], "Invalid IPv6 URL"),
-        ("/", ["Host: localhost", "Origin: http://["], "Invalid IPv6 URL"),
         ("/", ["Host: localhost", "Host: localhost"], "expected the header 'Host' once"),
-        ("/", ["Origin: null", "Origin: null"], "expected the header 'Origin' once"),
         ("/status.json", ["Authorization: a", "Authorization: b"], "'Authorization' once"),
     ],
 )
@@ -266,18 +262,25 @@ def test_status_says_what_happened(
     assert json.loads(get(server, "/status.json")[1])["latency"] == {}
     with client_of(server) as client:
         for tick in range(4):
-            client.infer(observe(tick, prompt="<b>go</b>"))
+            client.infer(observe(tick))
         _, text, headers = get(server, "/status.json")
         assert headers["Content-Type"] == "application/json" and headers["Cache-Control"]
         said = json.loads(text)
-        assert said["counts"] == {"answered": 4, "refused": 0, "busy": 0}
+        assert said["counts"] == {"connected": 1, "answered": 4, "refused": 0, "busy": 0}
         assert said["policy"]["checkpoint"] == "models/head"
         for part in ("vlm_ms", "head_ms", "wait_ms", "infer_ms"):
             taken = said["latency"][part]
             assert 0 < taken["p50"] <= taken["p99"] <= taken["p99.9"] <= taken["max"]
-        (robot,) = said["robots"]
-        assert (robot["peer"], robot["answers"], robot["prompt"]) == ("127.0.0.1", 4, "<b>go</b>")
-        assert robot["feature_age_s"] == pytest.approx(0.0, abs=1e-6)
+
+
+def test_a_part_that_took_no_time_is_not_counted(served_policy: Served) -> None:
+    status = ServerStatus(served_policy().metadata)
+    for ms in range(1, 1001):
+        status.answered({"vlm_ms": 0.0, "head_ms": ms, "wait_ms": 0.0, "infer_ms": 2 * ms})
+    latency = json.loads(status.json(0))["latency"]
+    assert set(latency) == {"head_ms", "infer_ms"}
+    assert latency["head_ms"]["count"] == 1000
+    assert latency["infer_ms"]["p99"] == pytest.approx(1980.02)
 
 
 def test_stopping_answers_what_is_under_way_and_takes_no_more(
