@@ -115,17 +115,17 @@ class FirstLook:
         if not len(strange):
             return
         far = ", ".join(f"{self._names[c]} {reading[c]:.4g} ({away[c]:.0f})" for c in strange[:6])
-        found = f"state: far from what the policy was trained on (standard deviations): {far}"
+        far_off = f"state: far from what the policy was trained on (standard deviations): {far}"
         for unit, name, factor in _UNITS:
             of_unit = self._units == unit
             scaled = np.where(of_unit, reading * factor, reading)
             if of_unit[strange].all() and (self._deviations(scaled[None]) <= _UNIT_FITS).all():
                 raise ObservationError(
-                    f"{found}. Read as {name}, they fit: send {unit}, {factor:.6g} times as much."
+                    f"{far_off}. Read as {name}, they fit: send {unit}, {factor:.6g} times as much."
                 )
         if len(strange) > 1 and (order := self._other_order(reading)):
             raise ObservationError(
-                f"{found}. In another order they fit: {order}. Send the channels in the order "
+                f"{far_off}. In another order they fit: {order}. Send the channels in the order "
                 f"{', '.join(self._names)}."
             )
 
@@ -165,10 +165,11 @@ def _fits_better(seen: Palette, own: Sequence[Palette], other: Sequence[Palette]
     if len(own) < 2 or len(other) < 2:
         return False
     own_left, other_left = (
-        [_distance(one, [rest for rest in kind if rest is not one]) for one in kind]
+        [_distance(golden, [rest for rest in kind if rest is not golden]) for golden in kind]
         for kind in (own, other)
     )
-    across = [_distance(one, other) for one in own] + [_distance(one, own) for one in other]
+    across = [_distance(golden, other) for golden in own]
+    across += [_distance(golden, own) for golden in other]
     told_apart = min(across) >= _LEAST and all(
         left <= CLEARLY * apart for left, apart in zip(own_left + other_left, across, strict=True)
     )
@@ -182,7 +183,7 @@ def _distance(palette: Palette, kind: Sequence[Palette]) -> float:
 
     Squares, so that a small object of a strong colour counts.
     """
-    return min(float(np.sqrt(np.square(palette - one).mean())) for one in kind)
+    return min(float(np.sqrt(np.square(palette - golden).mean())) for golden in kind)
 
 
 def _shrink(frame: NDArray[np.uint8]) -> NDArray[np.float64]:

@@ -99,8 +99,8 @@ class ServerStatus:
 
     def __init__(self, metadata: Mapping[str, Any]) -> None:
         self.refused = self.busy = 0
-        told = ("checkpoint", "step", "model_type", "action_hz", "feature_spec_digest")
-        self._policy = {name: metadata[name] for name in told}
+        shown = ("checkpoint", "step", "model_type", "action_hz", "feature_spec_digest")
+        self._policy = {name: metadata[name] for name in shown}
         self._timings, self._since_s = Timings(_TIMED, _KEPT), monotonic()
         self._lock = threading.Lock()
 
