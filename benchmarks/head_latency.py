@@ -1,4 +1,4 @@
-"""What one act of the head takes, batch 1, for every expert: eager, compiled, exported, in int8.
+"""What one act of the head takes, batch 1, for every expert: eager, compiled and exported.
 
 The head is that of `params.yaml` with random weights, with the demo's features (49 slots of 128)
 and with as many as Qwen2.5-VL-3B would give (49 slots of 2,048), 1,026 sensor channels and 12 of
@@ -126,7 +126,7 @@ def build_ways(
             notes["torch.compile left out"] = str(error).splitlines()[0][:200]
     files: list[Path] = []
     try:
-        wide = ExportParams(output=folder, formats=("onnx",), int8=True, int8_tolerance=1e3)
+        wide = ExportParams(output=folder, formats=("onnx",))
         check_packages(wide)
         receipt = export_head(checkpoint, "", wide, lambda said: None)
         for name, file in receipt["files"].items():

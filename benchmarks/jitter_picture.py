@@ -9,7 +9,7 @@ from matplotlib.ticker import NullFormatter, StrMethodFormatter
 from numpy.typing import NDArray
 
 from pipeline.look.page.style import INK, PALETTE, finish, logarithmic, panels
-from pipeline.robot.timings import Timings
+from pipeline.robot.run_report import Timings
 
 _SLICES = 240
 """Parts of a run of which the latest tick is drawn."""

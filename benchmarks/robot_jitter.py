@@ -43,16 +43,9 @@ from pipeline.policy.policy import Policy
 from pipeline.robot.client import PolicyClient
 from pipeline.robot.limits import Limits
 from pipeline.robot.loop import StopKind
-from pipeline.robot.realtime import (
-    ANSWER_PARTS,
-    TICK_PARTS,
-    Decides,
-    RunReport,
-    RunSettings,
-    run_robot,
-)
+from pipeline.robot.realtime import PolicySession, RunSettings, run_robot
+from pipeline.robot.run_report import ANSWER_PARTS, TICK_PARTS, RunReport, Timings
 from pipeline.robot.session import ServedPolicy
-from pipeline.robot.timings import Timings
 from pipeline.simulation.insertion import TICK_HZ
 from pipeline.simulation.insertion_formats import INSTRUCTION
 from pipeline.simulation.realtime import SimulatedRobot
@@ -200,7 +193,7 @@ def main() -> None:
     )  # fmt: skip
 
 
-def run(connect: Callable[[], Decides], settings: RunSettings, seconds: float) -> Course:
+def run(connect: Callable[[], PolicySession], settings: RunSettings, seconds: float) -> Course:
     """Run the arm for so many seconds, an episode a run."""
     hz = settings.hz or TICK_HZ
     course, seed = Course(hz), 0
@@ -243,7 +236,7 @@ def tell(name: str, course: Course) -> None:
 
 
 @contextmanager
-def local(params: Params) -> Generator[Callable[[], Decides]]:
+def local(params: Params) -> Generator[Callable[[], PolicySession]]:
     """The policy in this process, its model on a thread beside the loop."""
     served = ServedPolicy.load(chosen(params), params.vlm, "cpu", say)
     with closing(served):
@@ -251,7 +244,7 @@ def local(params: Params) -> Generator[Callable[[], Decides]]:
 
 
 @contextmanager
-def remote(params: Params) -> Generator[Callable[[], Decides]]:
+def remote(params: Params) -> Generator[Callable[[], PolicySession]]:
     """The policy in a process of its own, behind `stages.serve`."""
     wanted = params.serve.model_copy(update={"port": 0, "fresh": False, "device": "cpu"})
     told = params.model_copy(update={"serve": wanted}).model_dump_json()

@@ -7,7 +7,6 @@ is from the policy. A file that is too far is refused, and what was there before
 
   python -m stages.export
   python -m stages.export --set export.formats=[torch]         without ONNX's packages
-  python -m stages.export --set export.int8=true               matrix products in int8 too
 """
 
 from stages.command import run

@@ -33,7 +33,7 @@ from pipeline.look.page.writing import write_report
 from pipeline.look.rollout import rollout_report
 from pipeline.policy.checkpoint import find_policy, load_policy
 from pipeline.robot.client import TOKEN_VARIABLE, PolicyClient
-from pipeline.robot.features import LiveFeatures
+from pipeline.robot.live_features import LiveFeatures
 
 
 def main(params: Params) -> None:

@@ -3,9 +3,9 @@
 Takes what stages.train_head wrote to train_head.output, or serve.checkpoint if it is given, and
 the model of vlm.checkpoint, which must give the features that the policy was trained on: that is
 proved before the first connection is taken. Listens on this machine alone unless serve.host says
-otherwise, which needs a token (serve.token_file or VLA_SERVE_TOKEN). A page at the same address
-shows latencies, ages, frames and actions; /healthz says OK. Ctrl-C answers what is under way and
-stops.
+otherwise, which needs a token (serve.token_file or VLA_SERVE_TOKEN). /status.json at the same
+address has counts, latencies and connections; /healthz says OK. Ctrl-C answers the observations
+that have come, and stops.
 
   python -m stages.serve                                    at ws://127.0.0.1:8000
   python -m stages.serve --set serve.port=0                 at a free port, which is printed
@@ -42,7 +42,7 @@ def main(params: Params) -> None:
                 f"{about['horizon']} actions at {about['action_hz']:g} Hz"
             )
             asked = "robots send the token" if token else "no token is asked for"
-            said = f"serving ws://{server.address} ({asked}); status: http://{server.address}"
+            said = f"serving ws://{server.address} ({asked}); status: http://{server.address}/status.json"
             stopped = server.run(partial(say, said))
     if stopped:
         raise KeyboardInterrupt

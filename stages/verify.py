@@ -41,8 +41,7 @@ from pipeline.base.errors import NumericsError, StoreIncomplete
 from pipeline.extract.reextract import reextract
 from pipeline.extract.repair import repair
 from pipeline.policy.checkpoint import find_policy, load_policy
-from pipeline.robot.features import LiveFeatures
-from pipeline.robot.proof import prove
+from pipeline.robot.live_features import LiveFeatures, prove
 from pipeline.store.repair_hints import mend
 from pipeline.store.verification import verify
 

@@ -1,4 +1,4 @@
-"""What a data set hands out, and how single samples become a batch."""
+"""The samples and batches of a data set, and how samples become a batch."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
@@ -18,11 +18,11 @@ Sample = Mapping[str, Any]
 
 @dataclass
 class UnifiedBatch(Batch):
-    """The store's batch, and what a tick looks like where there are no features of it.
+    """The store's batch with the time, episode and instruction of each tick.
 
-    It is an `Observation`: `policy.loss(batch, batch.action, batch.action_valid)` takes it, and
-    `QwenVLAUnified` its `inputs()`. With a store there are features and their `key`, without one
-    features have no slots and there are `images`.
+    With a store it has features and their `key`; without one it has `images`, and features have no
+    slots. It is an `Observation`: `policy.loss(batch, batch.action, batch.action_valid)` takes it,
+    and `QwenVLAUnified` takes its `inputs()`.
     """
 
     tick: Int64[Tensor, " batch"]
@@ -35,9 +35,9 @@ class UnifiedBatch(Batch):
     """Equal for ticks that see the same frames."""
     instruction: list[str]
     images: list[Frames] | None = None
-    """Of each sample, without views that its episode lacks; those of a VL row share the arrays."""
+    """Frames of each sample, without views that its episode lacks; one VL row shares arrays."""
     key: UInt8[Tensor, "batch 16"] | None = None
-    """Digest of feature spec, prompt and frames: what the cached features are of."""
+    """Digest of the features' spec, prompt and frames."""
 
     def __getitem__(self, index: int) -> Sample:
         if not -len(self) <= index < len(self):
@@ -50,7 +50,7 @@ class UnifiedBatch(Batch):
         return (self[index] for index in range(len(self)))
 
     def inputs(self) -> dict[str, Any]:
-        """Keyword arguments of `QwenVLAUnified.forward`; `actions` among them ask for a loss."""
+        """The keyword arguments with which `QwenVLAUnified.forward` gives the loss."""
         streams = ("feature_age", "sensor", "sensor_valid", "state", "state_valid", "action_valid")
         given = {name: getattr(self, name) for name in streams} | {"actions": self.action}
         if self.images is not None:
@@ -58,28 +58,29 @@ class UnifiedBatch(Batch):
         return given | {"features": self.features, "slot_valid": self.slot_valid}
 
     pin_memory = Batch.pin
-    """What `DataLoader(pin_memory=True)` calls."""
+    """`DataLoader(pin_memory=True)` calls this."""
 
 
 def unified_collate_fn(samples: Sequence[Sample] | UnifiedBatch) -> UnifiedBatch:
-    """The batch of these samples of one data set; a batch read in one go passes through.
+    """The batch of these samples of one data set; a batch stays as it is.
 
-    Windows have one length already, so nothing is padded here: `*_valid` says what is real.
-    Raises `StoreMismatch` where some samples have features and others have frames.
+    Windows have one length already: `*_valid` says how much of each is real. Raises `StoreMismatch`
+    where some samples have features and others have frames.
     """
     if isinstance(samples, UnifiedBatch):
         return samples
-    names = [field.name for field in fields(UnifiedBatch)]
     cached = sum(sample["images"] is None for sample in samples)
     if cached not in (0, len(samples)):
         raise StoreMismatch(
             f"a batch has features or frames, but {cached} of its {len(samples)} samples have "
             "features of a store. Give all data sets a store, or none"
         )
-    return UnifiedBatch(**{name: _together([sample[name] for sample in samples]) for name in names})
+    return UnifiedBatch(
+        **{f.name: _stack([sample[f.name] for sample in samples]) for f in fields(UnifiedBatch)}
+    )
 
 
-def _together(values: list[Any]) -> Any:
+def _stack(values: list[Any]) -> Any:
     if values[0] is None:
         return None
     return torch.stack(values) if isinstance(values[0], Tensor) else values

@@ -1,4 +1,4 @@
-"""One data set over every format, with frames or with cached features."""
+"""One data set over every format, with frames or with a store's features."""
 
 from collections.abc import Sequence
 from dataclasses import asdict
@@ -14,8 +14,14 @@ from tqdm import tqdm
 from pipeline.base.config import Source, SplitParams
 from pipeline.base.errors import ConfigError, RecordingError
 from pipeline.compat.batch import Sample, UnifiedBatch
-from pipeline.compat.cached import check_store, episodes_of_format, episodes_of_recordings
-from pipeline.compat.memory import first_keys, in_memory, read_frames
+from pipeline.compat.stores import (
+    check_store,
+    episodes_of_format,
+    episodes_of_recordings,
+    first_keys,
+    read_frames,
+    store_in_memory,
+)
 from pipeline.data import Recording, open_recordings
 from pipeline.data.episode import read_episode
 from pipeline.data.row_range import RowFrames
@@ -31,24 +37,22 @@ Place = str | Path | Source
 
 
 class UnifiedVLADataset(Dataset[Sample]):
-    """One item a tick: windows that end at it, the action chunk that begins at it, what it sees.
+    """One item a tick: the windows that end there, the chunk that begins there, frames or features.
 
     Without `store` the streams of all recordings are read into memory (2.7 MB a second of a
-    1,026-channel sensor at 650 Hz) and frames are decoded when a tick is asked for. With `store`
-    no stream and no frame of a recording is read: items hold the store's features, and `data` only
-    says of which recordings, None of all. Ticks and windows are those of training either way: see
-    `build_timeline` and `FeatureStore.gather`. Of a store's variants items show 0, the plain
-    frames; `stages.train_head` draws others too.
+    1,026-channel sensor at 650 Hz), and frames are decoded when an item is read. With `store`
+    items have its features, of the plain frames only, and no stream or frame of a recording is
+    read; `data` then selects recordings, None all. Ticks and windows are those of training either
+    way: see `build_timeline` and `FeatureStore.gather`.
 
     `horizon` is in ticks, the windows in readings, none of them older than `sensor_window_s` and
-    `state_window_s` (None: of any age); `action_hz` None takes recorded rows as ticks, and whatever
-    ticks a store has.
-    `recordings`, open already, may stand in the place of `data`; what they are read with stays.
-    `instruction` replaces what those of `data` say. Old and new recordings in one data set have
-    actions of one kind, `action_rotation`; `auto` is rotvec where every recording has poses.
+    `state_window_s` (None: of any age). An `action_hz` of None takes recorded rows as ticks, or
+    the ticks of the store. Open `recordings` may replace `data`. `instruction` replaces the
+    instructions of `data`. All recordings have one kind of `action_rotation`; `auto` is rotvec
+    where every recording has poses.
 
-    Works in DataLoader workers however they are started: a pickle opens the data again. Use
-    `unified_collate_fn`. Raises `RecordingError` for recordings that are not there or broken,
+    Works in DataLoader workers however they are started: unpickling opens the data again. Use
+    `unified_collate_fn`. Raises `RecordingError` for recordings that are missing or broken,
     `StoreMismatch` for a store of other ticks or without these recordings, `ConfigError` for
     settings that contradict each other.
     """
@@ -56,9 +60,9 @@ class UnifiedVLADataset(Dataset[Sample]):
     store: FeatureStore
     """The store, or the recordings' streams in memory laid out as one without features."""
     episodes: tuple[Episode, ...]
-    """Those of `store` that this data set is of, with the names that its sources have here."""
+    """The episodes of this data set in `store`, under the names of its own sources."""
     ticks: NDArray[np.int64]
-    """(item,) index of each item's tick in `store`."""
+    """(item,) index in `store` of each item's tick."""
 
     def __init__(
         self,
@@ -94,15 +98,12 @@ class UnifiedVLADataset(Dataset[Sample]):
                 "horizon, windows and vlm_reuse_count count from 1, found "
                 f"{self.windows} and vlm_reuse_count={vlm_reuse_count}"
             )
-        given = {"data": data, "instruction": instruction, "views": views}
-        if recordings is None:
-            del given["data"]
         opened = recordings is not None or self._cached is not None
-        if opened and any(value is not None for value in given.values()):
+        both = recordings is not None and data is not None
+        if both or (opened and not (instruction is None and views is None)):
             raise ConfigError(
-                f"{', '.join(given)} decide how recordings are opened and seen, but the recordings "
-                "are open already, or their features computed. Leave these out, or recordings and "
-                "store"
+                "data, instruction and views say how recordings are opened, but the recordings are "
+                "open already, or their features computed. Leave these out, or recordings and store"
             )
         self._open()
 
@@ -113,7 +114,7 @@ class UnifiedVLADataset(Dataset[Sample]):
         return self.__getitems__([index])[0]
 
     def __getitems__(self, indices: Sequence[int]) -> UnifiedBatch:
-        """These items in one gather; what torch's DataLoader calls for a batch."""
+        """These items in one gather; torch's DataLoader calls this for a batch."""
         ticks = self.ticks[np.asarray(indices, np.int64)]
         batch = self.store.gather(ticks, **asdict(self.windows))
         rows = self.store.array("tick/vl_row")[ticks]
@@ -138,10 +139,9 @@ class UnifiedVLADataset(Dataset[Sample]):
     def split(self, val_fraction: float = 0.15) -> tuple[Subset[Sample], Subset[Sample]]:
         """Items to train on and items held out: whole groups of episodes, by `split_by_episode`.
 
-        Over a store these are train and val of `stages.train_head` with `train_head.split` {val:
-        `val_fraction`, test: 0}. Over frames they are the
-        same where sources and episodes have the names that they have in the store: the side
-        follows from the hash of "source/id". Use `unified_collate_fn`.
+        With a store these are train and val of `stages.train_head` under `train_head.split` {val:
+        `val_fraction`, test: 0}, and with frames too where sources and episodes have the store's
+        names: the side follows from the hash of "source/id". Use `unified_collate_fn`.
         """
         keys = None if self._frames is None else first_keys(self._frames)
         params = SplitParams(val=val_fraction, test=0)
@@ -176,7 +176,7 @@ class UnifiedVLADataset(Dataset[Sample]):
         settings = (self.action_hz, self.vlm_reuse_count)
         bar = tqdm(recordings, "reading", unit="episode", disable=None, leave=False)
         read = [read_episode(recording, *settings, rotation) for recording in bar]
-        self.store, self._frames = in_memory(read, *settings)
+        self.store, self._frames = store_in_memory(read, *settings)
         self.episodes = self.store.episodes
 
     def _recordings(self) -> Sequence[Recording]:
@@ -196,7 +196,7 @@ class UnifiedVLADataset(Dataset[Sample]):
         return opened.recordings
 
     def __getstate__(self) -> dict[str, Any]:
-        # Opened again where it is unpickled: streams and file handles are not sent.
+        # Streams and file handles are not pickled: unpickling opens the data again.
         opened = ("store", "episodes", "ticks", "_frames")
         return {name: value for name, value in vars(self).items() if name not in opened}
 
@@ -222,7 +222,7 @@ class NewAsyncInsertionDataset(UnifiedVLADataset):
 def named_sources(
     data: Place | Sequence[Place], format: Format, instruction: str | None = None
 ) -> tuple[Source, ...]:
-    """The named sources, and all bare paths as one that is named after the format."""
+    """The named sources, and all bare paths as one source named after the format."""
     places = [data] if isinstance(data, str | Path | Source) else list(data)
     named = [place for place in places if isinstance(place, Source)]
     paths = tuple(str(place) for place in places if not isinstance(place, Source))

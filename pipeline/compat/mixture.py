@@ -17,16 +17,16 @@ from pipeline.train.sampling import TickSampler
 
 
 class MixtureBatches(Sampler[list[int]]):
-    """Batches of items, each a function of (seed, step); a batch sampler of a DataLoader.
+    """The batch sampler of a DataLoader: a batch is a function of (seed, step).
 
-    The sources' shares of the draws are as `weights`, 1 where not named, whatever their sizes;
-    kept to one draw. An epoch is as many draws as there are items. An iteration goes from
-    `first_step` to the end of its epoch; its first batch moves `first_step` to the next epoch, so
-    that none is repeated where an iteration is broken off. To resume a run, set `first_step` to
-    the number of batches it has taken.
+    Each source's share of the draws is its weight (1 where not named), whatever its size, exact to
+    one draw. An epoch has as many draws as there are items. An iteration goes from `first_step` to
+    the end of its epoch; its first batch moves `first_step` to the next epoch, so that an iteration
+    that is broken off is not repeated. To resume a run, set `first_step` to the number of batches
+    that it has taken.
 
-    Raises `ConfigError` for weights that are negative or of a source that is not there, where no
-    source has both items and weight, and for batches without an item.
+    Raises `ConfigError` for a weight that is negative or of an unknown source, where no source has
+    both items and weight, and for batches without an item.
     """
 
     def __init__(
@@ -45,7 +45,7 @@ class MixtureBatches(Sampler[list[int]]):
                 "one that has items above 0; found "
                 f"batch_size {batch_size}, items {sizes}, weights {dict(weights)}"
             )
-        # TickSampler weighs items; divided by their number, weights are those of sources.
+        # TickSampler weighs items: a source's weight is divided by the number of its items.
         of_items = {name: weights.get(name, 1.0) / max(1, size) for name, size in sizes.items()}
         self._sampler = TickSampler(by_source, of_items, batch_size, seed)
         self.steps_per_epoch = -(-sum(sizes.values()) // batch_size)
@@ -55,7 +55,7 @@ class MixtureBatches(Sampler[list[int]]):
         return self.steps_per_epoch - self.first_step % self.steps_per_epoch
 
     def __iter__(self) -> Iterator[list[int]]:
-        # At the first batch, not before: a DataLoader with workers makes two iterators of an epoch.
+        # At the first batch, because a DataLoader with workers makes two iterators of an epoch.
         begin = self.first_step
         self.first_step += len(self)
         for step in range(begin, self.first_step):
@@ -84,16 +84,15 @@ def create_unified_dataloader(
     multiprocessing_context: str | None = None,
     **settings: Any,
 ) -> DataLoader[Any]:
-    """A loader of `UnifiedBatch`es: old and new recordings of one data set, 1 : 3 of the draws.
+    """A loader of `UnifiedBatch`es that draws three new items for each old one.
 
-    `old_weight` and `new_weight` are shares of the draws, whatever the sizes: 1 and 3 draw three
-    new items for an old one. The weights of `train_head.mixture` are another thing: they are of
-    each tick, and a source's share is its weight times its ticks.
+    `old_weight` and `new_weight` are shares of the draws, whatever the sizes. `train_head.mixture`
+    differs: it weighs each tick, so a source's share is its weight times its ticks.
 
-    `settings` go to the `UnifiedVLADataset`, which is the loader's `dataset`; of it, `val_fraction`
-    of the episodes are never drawn: `loader.dataset.split(val_fraction)[1]` has them. The loader's
-    `batch_sampler` is the `MixtureBatches`, by which a run is resumed. Where only a `store` is
-    named, its episodes are old and new by their formats. Raises what these raise.
+    `settings` go to the `UnifiedVLADataset`, the loader's `dataset`. `val_fraction` of its episodes
+    are never drawn: `loader.dataset.split(val_fraction)[1]` has them. The loader's `batch_sampler`
+    is the `MixtureBatches` that resumes a run. With only a `store`, episodes are old and new by
+    their formats. Raises as these classes do.
     """
     old = named_sources(old_dataset_patterns, "old")
     sources = [*old, *named_sources(new_dataset_path or (), "new")]
@@ -114,7 +113,7 @@ def create_unified_dataloader(
     if foreign := sorted(set(items) - set(weights)):
         raise ConfigError(
             f"the store has episodes of the formats {', '.join(foreign)} beside old and new ones, "
-            "and no weight is theirs. Name old_dataset_patterns and new_dataset_path"
+            "which have no weight. Name old_dataset_patterns and new_dataset_path"
         )
     batches = MixtureBatches(items, {name: weights[name] for name in items}, batch_size, seed)
     return DataLoader(

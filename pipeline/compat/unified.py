@@ -1,8 +1,8 @@
-"""A policy with a vision-language model in front, under the name and arguments it is known by.
+"""`QwenVLAUnified`: a policy with a vision-language model in front, as the research code named it.
 
 Features come from the model (images and an instruction), from a cache, or sample by sample from
-either. This is a door: `Policy` and `pipeline.vlm.live.LiveVLM` do the work, and the latter is
-asked for when a model is loaded.
+either. `Policy` and `pipeline.vlm.live.LiveVLM` do the work; the latter is imported when a model is
+loaded.
 """
 
 from collections.abc import Mapping, Sequence
@@ -40,7 +40,7 @@ _SEED_PARTS: Mapping[str, Mapping[str, Any]] = {
     "expert": {"dim": 512, "layers": 4, "heads": 8},
     "diffusion": {"prediction": "epsilon"},
 }
-"""Of the parts this class has always had, where params.yaml has leaner defaults."""
+"""Sizes of the research code's parts; params.yaml has leaner defaults."""
 
 _ACTION_GROUPS = ("translation",) * 3 + ("rotation",) * 3 + ("gripper",)
 
@@ -48,9 +48,8 @@ _ACTION_GROUPS = ("translation",) * 3 + ("rotation",) * 3 + ("gripper",)
 class QwenVLAUnified(LivePolicy[LiveVLM]):
     """Qwen2.5-VL, encoders, fusion and action expert as one `Trainable` module.
 
-    `vlm` is None until it is first needed or `load_vlm` is called: with cached features alone no
-    checkpoint is read. Asking a model whose `finetune_vl` is not none for its parameters loads it,
-    so that an optimizer sees them.
+    `vlm` is None until images need it or `load_vlm` is called, so that cached features need no
+    checkpoint. Unless `finetune_vl` is none, `parameters()` loads it too, for the optimizer.
     """
 
     def __init__(
@@ -77,17 +76,17 @@ class QwenVLAUnified(LivePolicy[LiveVLM]):
         tuning: Mapping[str, Any] | None = None,
         **head: Any,
     ) -> None:
-        """Build the policy; `vlm`, `tuning` and `head` are more params of those sections.
+        """Build the policy; `vlm`, `tuning` and `head` are further params of those sections.
 
-        `head` is that of `train_head`: `sensor_enabled` and `robot_state_enabled` (True), `horizon`
-        (8), `sensor_window` (65 readings), `sensor_window_s` (0.1), `state_window` (100),
-        `state_window_s` (1.0) and all others. Of a part of the policy,
-        such as `sensor_encoder`, what `head` does not name stays as this class has always had it.
+        `head` takes the keys of `train_head`: `sensor_enabled` and `robot_state_enabled` (True),
+        `horizon` (8), `sensor_window` (65 readings), `sensor_window_s` (0.1), `state_window` (100),
+        `state_window_s` (1.0) and all others. A part such as `sensor_encoder` keeps the research
+        code's sizes for the keys that `head` does not name.
 
-        `feature_dim` is the width of the checkpoint's hidden states: by default what a checkpoint
-        folder says of itself, and 2048 (that of Qwen2.5-VL-3B) for a hub id. Of seven action
-        channels three are translations, three rotations and one the gripper; of any other number
-        all are `other`. Values are checked as the params of the same name are (`ValidationError`).
+        `feature_dim` is the width of the checkpoint's hidden states: by default that of the
+        checkpoint's folder, and 2048 (Qwen2.5-VL-3B) for a hub id. Seven action channels are three
+        translations, three rotations and the gripper; any other number are all `other`. Values are
+        checked as the params of the same name are (`ValidationError`).
 
         WARNING: without `normalization` every stream is taken as it is. Physical units (degrees,
         millimetres, raw A-scans) train badly: give the `pipeline.policy.normalization` of the data.
@@ -114,9 +113,10 @@ class QwenVLAUnified(LivePolicy[LiveVLM]):
 
     @classmethod
     def of(cls, policy: Policy, vlm: LiveVLM) -> "QwenVLAUnified":
-        """The model of two parts; `VLMError` where their features differ in number or width.
+        """The model of a policy and a vision-language model.
 
-        Raises `CheckpointMismatch` where a checkpoint's policy was trained on other features.
+        Raises `VLMError` where their features differ in number or width, `CheckpointMismatch` where
+        a checkpoint's policy was trained on other features.
         """
         if policy.feature_spec is not None:
             vlm.refuse_other_features(policy.feature_spec)
@@ -134,7 +134,7 @@ class QwenVLAUnified(LivePolicy[LiveVLM]):
         self.vlm_params, self.tuning = vlm, tuning
 
     def __getstate__(self) -> dict[str, Any]:
-        """All but the preparer, whose caches cannot be pickled and which is made again."""
+        """Leave out the preparer, whose caches cannot be pickled; it is made again."""
         return {name: value for name, value in self.__dict__.items() if name != "_preparer"}
 
     def forward(
@@ -152,15 +152,15 @@ class QwenVLAUnified(LivePolicy[LiveVLM]):
     ) -> Tensor:
         """The loss where `actions` are given, else an action chunk (batch, horizon, action).
 
-        `images` has the frames of each sample, with `text` its instruction; a sample whose frames
-        are None keeps its cached `features` (batch, slot, dim). `sensor` (batch, window, channel),
+        `images` are the frames of each sample, `text` its instruction; a sample whose frames are
+        None keeps its cached `features` (batch, slot, dim). `sensor` (batch, window, channel),
         `state` (batch, window, dim) and `actions` (batch, horizon, action) are in physical units,
-        tensors or arrays; what is not given is missing. Of a stream is real what `slot_valid`
-        (batch, slot) marks and the last `sensor_valid`, `state_valid` (batch,) readings, without
-        them all; `feature_age` (batch,), `view_age` (batch, view), `sensor_age` and `state_age`
-        (batch, window) are in s. A chunk is computed without dropout even in
-        `train()` mode, which stays as it is. Raises `ObservationError` for a shape that does not
-        fit and where there is nothing to look at.
+        tensors or arrays; a stream that is not given is missing. `slot_valid` (batch, slot) marks
+        valid slots, `sensor_valid` and `state_valid` (batch,) count the valid readings at the end
+        of a window; without them all are valid. `feature_age` (batch,), `view_age` (batch, view),
+        `sensor_age` and `state_age` (batch, window) are in s. A chunk is computed without dropout
+        in `train()` mode too, and the mode stays. Raises `ObservationError` for a shape that does
+        not fit, and where nothing is given.
         """
         streams = {"features": features, "sensor": sensor, "state": state}
         observation = self.observe(images, text, **streams, **validity)
@@ -183,7 +183,7 @@ class QwenVLAUnified(LivePolicy[LiveVLM]):
         text: Sequence[str] | None = None,
         **streams: Any,
     ) -> LiveObservation:
-        """The observation of what `forward` takes; equal frames and text share a row."""
+        """The observation of the arguments of `forward`; equal frames and text share a row."""
         if unknown := streams.keys() - Observation.__dataclass_fields__.keys():
             raise TypeError(f"unexpected arguments: {', '.join(sorted(unknown))}")
         rows: list[PreparedRow] = []
@@ -209,7 +209,7 @@ def no_normalization(shape: PolicyShape) -> Normalization:
 
 
 def _with_seed_parts(head: Mapping[str, Any]) -> dict[str, Any]:
-    """Params of `head`, where a part of which it names only some keys keeps this class's others."""
+    """`head` with the research code's sizes for the keys of each part that it does not name."""
     named = {name: head[name] for name in _SEED_PARTS if isinstance(head.get(name), Mapping)}
     merged = {name: {**_SEED_PARTS[name], **part} for name, part in named.items()}
     return {**_SEED_PARTS, **head, **merged}
@@ -240,8 +240,8 @@ class QwenVLAWithSensor(QwenVLAUnified):
         super().__init__("regression", **arguments)
 
 
-class Not_freeze_QwenVLAWithSensor(QwenVLAUnified):  # noqa: N801 (the name it is known by)
-    """The unified model with the regression expert, every weight of the model learning."""
+class Not_freeze_QwenVLAWithSensor(QwenVLAUnified):  # noqa: N801 (the research code's name)
+    """The unified model with the regression expert, whose every weight learns."""
 
     def __init__(self, **arguments: Any) -> None:
         arguments.setdefault("finetune_vl", "full")

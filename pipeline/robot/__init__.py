@@ -1,20 +1,23 @@
 """The control loop that a robot and a rollout run, and the policy server that a robot asks.
 
-loop.py                  what is due in which tick: the loop that rollouts and robots share
-chunking.py, guides.py   how action chunks are played, and how the next continues the one under way
-realtime.py, beside.py   the loop in real time, and what goes on beside its ticks
-limits.py, timings.py    what a robot may do, and how long each part of its ticks took
-lerobot_arm.py           a robot with LeRobot's interface as one of ours
+On the robot's computer, without torch:
+loop.py            what is due in which tick, and the safe stops: shared by rollouts and robots
+chunking.py        how action chunks are played, and how the next continues the one that is played
+realtime.py        the loop in real time: pacing, one tick, safe stops
+readings.py        a robot's readings until they go to the policy, and its clock
+limits.py          what a robot may do
+process.py         the policy's thread, the watchdog, priority and signals
+run_report.py      timings and missed ticks, and why a run ended
+lerobot_arm.py     a robot with LeRobot's interface
+wire.py, client.py messages, and the client of the policy server
+recorder.py, run_recording.py  a run becomes a recording
 
-memory.py                the newest readings and features of one robot, as a policy takes them
-features.py              frames -> features, by the very model that the policy was trained on
-proof.py                 the live model gives the features of training: golden rows computed again
-first_look.py            a robot's first frames and states are what training saw
-observation.py           what a robot says, checked
-session.py               a served policy, and what it remembers of each robot
-server.py, status.py     it is served over a websocket, and a page shows how it goes
-wire.py, client.py       the messages, and the client; no torch
-
-recorder.py, run_recording.py   a run becomes a recording
-export.py, export_inputs.py     the head as ONNX and torch.export
+Beside the policy:
+observation.py     a robot's observation, checked
+robot_memory.py    the newest readings and features of one robot, as a policy takes them
+live_features.py   frames -> features by the policy's own model, proved by golden rows
+first_look.py      refuses exchanged views, colours, units and channels
+session.py         a served policy, and its memory of each robot
+server.py          the websocket server, and its counts and latencies
+export.py, export_inputs.py    the head as ONNX and torch.export
 """

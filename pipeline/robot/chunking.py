@@ -1,6 +1,6 @@
-"""Action chunks played one step a tick: what of a plan is due, averaged, or left to continue.
+"""Plays action chunks one step a tick, and says what of a plan the next chunk is to continue.
 
-Numpy only; `pipeline.robot.guides` makes tensors of guides.
+Numpy only; `pipeline.robot.session.stack_guides` makes tensors of guides.
 """
 
 from collections import deque
@@ -22,15 +22,15 @@ ENSEMBLE_DECAY = 0.01
 """m of temporal ensembling, as in Zhao et al. 2023: the smaller, the more a new chunk counts."""
 
 DELAYS = 10
-"""How many of the newest delays the next one is expected to stay within."""
+"""Newest delays, the largest of which the next one is expected not to exceed."""
 
 
 @dataclass(frozen=True)
 class PlanGuide:
-    """What is left of a robot's plan at the tick of an observation: step 0 is that tick's.
+    """The rest of a robot's plan; step 0 belongs to the tick of the observation.
 
-    `chunk` (horizon, action) in physical units, zeros where the plan has ended; `weight` (horizon,)
-    in [0, 1], 0 there.
+    `chunk` (horizon, action) is in physical units, `weight` (horizon,) in [0, 1]; both are 0 where
+    the plan has ended.
     """
 
     chunk: Steps
@@ -39,10 +39,10 @@ class PlanGuide:
 
 @dataclass(frozen=True)
 class _Chunk:
-    """A chunk of which step 0 belongs to tick `start`.
+    """A chunk whose step 0 belongs to tick `start`.
 
-    `wanted` (horizon, action): of channels that move, the place after each step, counted from where
-    the robot was when the executor began; of others, the step itself.
+    `wanted` (horizon, action) is the place after each step, counted from where the robot was when
+    the executor began; for channels that do not move it is the step itself.
     """
 
     start: int
@@ -56,14 +56,13 @@ class Executor:
     `none` plays the newest chunk, `temporal` averages all chunks that reach a tick (`ensemble`),
     `rtc` plays the newest chunk and guides the next one by it (real-time chunking, Black et al.
     2025). A chunk's first step belongs to the tick of its observation, which `begin` marks; the
-    steps played until `plan` hands it in are skipped, as counted.
+    steps that were played before `plan` takes the chunk are skipped.
 
-    Channels that `moving` (action,) marks say how far to move. A chunk then means the places that
-    its steps add up to, from where the robot had been sent when its observation was made. Places
-    are what is averaged, and an action leads from the last place to the next. So what an older
-    chunk moved in between is not moved again, but the first action of a late chunk may be as long
-    as several steps: limits are the caller's. Rotations are added as vectors, which holds for small
-    ones. None marks no channel: each says where to be.
+    `moving` (action,) marks the channels that say how far to move; None marks none. For them a
+    chunk means places: its steps add up from where the robot had been sent at the observation.
+    Places are averaged, and an action leads from the last place to the next. So a motion of an
+    older chunk is not repeated, but the first action of a late chunk may be as long as several
+    steps: limits are the caller's. Rotations are added as vectors, which holds for small ones.
 
     Raises `ConfigError` where `execute`, the steps from one observation to the next, is not within
     the horizon.
@@ -83,7 +82,7 @@ class Executor:
         self.reset()
 
     def reset(self) -> None:
-        """Forget all chunks and counts, for the next episode."""
+        """Begin the next episode, without chunks."""
         self._tick = 0
         self._begun: int | None = None
         self._chunks: list[_Chunk] = []
@@ -95,8 +94,8 @@ class Executor:
     def due(self) -> bool:
         """Whether to observe for the next chunk before the next action.
 
-        So it is before the first chunk, `execute` steps after the newest chunk's observation, and
-        where that chunk is used up; never between `begin` and `plan`.
+        True before the first chunk and `execute` steps after the observation of the newest one;
+        never between `begin` and `plan`.
         """
         if self._begun is not None:
             return False
@@ -104,7 +103,7 @@ class Executor:
 
     @property
     def planned(self) -> bool:
-        """Whether a chunk has ever come."""
+        """Whether a chunk has come."""
         return bool(self._chunks)
 
     @property
@@ -113,9 +112,10 @@ class Executor:
         return any(self._tick - chunk.start < self.horizon for chunk in self._chunks)
 
     def begin(self) -> PlanGuide | None:
-        """Mark this tick as that of the next chunk's observation, also in place of an earlier mark.
+        """Mark this tick as that of the next chunk's observation; an earlier mark is dropped.
 
-        Returns what a policy is to continue: None but for `rtc` with a plan that reaches further.
+        Returns what the policy is to continue, with `rtc` and a plan that reaches further; else
+        None.
         """
         self._begun, self._sent_at_begin = self._tick, self._sent
         if self.chunking != "rtc" or not self._chunks:
@@ -134,7 +134,7 @@ class Executor:
         return PlanGuide(rest, soft_mask(self.horizon, max(self._delays), overlap))
 
     def refused(self) -> None:
-        """There will be no chunk of the observation that `begin` marked."""
+        """Note that no chunk comes for the observation that `begin` marked."""
         self._begun = None
 
     def plan(self, chunk: ArrayLike) -> None:
@@ -150,9 +150,9 @@ class Executor:
         self._begun = None
 
     def next_action(self) -> Steps:
-        """The action of this tick, (action,), which counts as played.
+        """Play this tick: its action (action,).
 
-        There must be a chunk that reaches it: `plan` comes in time, or the caller stops the robot.
+        A chunk must reach it: where `plan` comes too late, the caller stops the robot.
         """
         assert self.reaches, f"no action at tick {self._tick}: no chunk came in time"
         self._chunks = [c for c in self._chunks if self._tick - c.start < self.horizon]
@@ -164,17 +164,17 @@ class Executor:
         return action.astype(np.float32)
 
     def sent(self, action: ArrayLike) -> None:
-        """Tell what was really sent, (action,), in place of what `next_action` gave last.
+        """Note the action (action,) that was really sent in place of the last `next_action`.
 
-        A moving channel's next action then leads from where the robot was really sent to the next
-        place of the plan, so what was cut off is made up for as soon as limits allow, unless a
-        newer chunk says otherwise: it counts from where the robot had really been sent, too.
+        A moving channel's next action leads from there to the next place of the plan, so a motion
+        that was cut off is made up for as soon as limits allow. A newer chunk counts from there,
+        too.
         """
         self._sent = np.where(self._moving, self._sent_before + np.asarray(action), 0.0)
 
 
 def ensemble(predicted: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The mean (action,) of predictions (prediction, action) for a tick, oldest first.
+    """The weighted mean (action,) of predictions (prediction, action) for a tick, oldest first.
 
     Weights exp(-m i), i = 0 the oldest (Zhao et al. 2023, "Learning Fine-Grained Bimanual
     Manipulation with Low-Cost Hardware", Algorithm 2).
@@ -186,9 +186,9 @@ def ensemble(predicted: NDArray[np.float64]) -> NDArray[np.float64]:
 def soft_mask(horizon: int, delay: int, overlap: int) -> Steps:
     """How strongly each step of a chunk is to continue the plan under way, (horizon,).
 
-    1 for the `delay` steps that are played meanwhile, 0 from `overlap` on, where the plan has
-    ended, and falling between them (Black, Galliker and Levine 2025, "Real-Time Execution of
-    Action Chunking Flow Policies", eq. 5, with `overlap` = H - s).
+    1 for the `delay` steps that are played meanwhile, 0 from `overlap` on, where the plan ends, and
+    falling between them (Black, Galliker and Levine 2025, "Real-Time Execution of Action Chunking
+    Flow Policies", eq. 5, with `overlap` = H - s).
     """
     delay, step = min(delay, overlap), np.arange(horizon)
     share = (overlap - step) / (overlap - delay + 1)
@@ -197,7 +197,7 @@ def soft_mask(horizon: int, delay: int, overlap: int) -> Steps:
 
 
 def check_chunking(chunking: "Chunking", stochastic: bool) -> None:
-    """Raise `ConfigError` where a policy cannot be guided: one that draws nothing."""
+    """Raise `ConfigError` for `rtc` with a policy that samples nothing to guide."""
     if chunking == "rtc" and not stochastic:
         raise ConfigError(
             "rollout.chunking: expected none or temporal, as this policy draws nothing that could "

@@ -1,4 +1,4 @@
-"""A client of the policy server, for the robot's computer: needs numpy, msgpack and websockets."""
+"""The client of the policy server, for the robot's computer: numpy, msgpack and websockets."""
 
 from collections.abc import Mapping
 from contextlib import AbstractContextManager, ExitStack
@@ -14,18 +14,18 @@ from pipeline.base.errors import CheckpointMismatch, ObservationError, ServerBus
 from pipeline.robot import wire
 
 TOKEN_VARIABLE: Final = "VLA_SERVE_TOKEN"
-"""Of the environment: the token, where nothing else says it."""
+"""The environment variable with the token."""
 
 
 class PolicyClient(AbstractContextManager["PolicyClient"]):
-    """One robot's connection to a policy server, which is one memory there.
+    """One robot's connection to a policy server, which has one memory for it.
 
-    To be closed, or used in a `with` statement. Its errors are `ServerError`s; what the server
-    finds wrong with an observation is an `ObservationError`.
+    Close it, or use it in a `with` statement. Raises `ServerError`, and `ObservationError` where
+    the server refuses an observation.
     """
 
     metadata: Mapping[str, Any]
-    """What is served: streams with names and units, rates, horizon, feature spec."""
+    """Of the policy: streams with names and units, rates, horizon, feature spec."""
 
     def __init__(
         self,
@@ -34,12 +34,12 @@ class PolicyClient(AbstractContextManager["PolicyClient"]):
         robot: Mapping[str, Any] | None = None,
         timeout_s: float = 10.0,
     ) -> None:
-        """Connect; `timeout_s` is for the connection and for each answer.
+        """Connect; `timeout_s` bounds the connection and each answer.
 
-        `robot` describes the own robot, as far as it is known: names by `state`, `sensor`,
-        `action`, their `…_units`, `action_kind`, `views`, `action_hz`. Raises `ServerError` where
-        nobody listens or the token is another, and `CheckpointMismatch` where the policy was
-        trained on another robot than described.
+        `robot` describes the robot, as far as it is known: names by `state`, `sensor`, `action`,
+        their `…_units`, `action_kind`, `views`, `action_hz`. Raises `ServerError` where nobody
+        listens or the token is wrong, `CheckpointMismatch` where the policy was trained on another
+        robot.
         """
         self._url = url if "://" in url else f"ws://{url}"
         if not self._url.startswith(("ws://", "wss://")):
@@ -51,29 +51,29 @@ class PolicyClient(AbstractContextManager["PolicyClient"]):
         self.reconnect()
 
     def reconnect(self) -> None:
-        """Connect anew, which begins a new episode: the server's memory of the last is gone."""
+        """Connect again and begin a new episode: the server's memory of the last is gone."""
         self.close()
         self._connection = self._connected()
         try:
-            self.metadata = wire.unpack(self._said())
+            self.metadata = wire.unpack(self._receive())
             refuse_other_robot(self._robot, self.metadata)
         except Exception:
             self.close()
             raise
 
     def infer(self, observation: Mapping[str, Any]) -> dict[str, Any]:
-        """The answer to an observation: `actions` (horizon, action), and what goes with it.
+        """The answer to an observation, with `actions` (horizon, action).
 
-        Raises `ObservationError` where the server refuses it, `ServerBusy` where too many wait (the
-        connection stays, and has taken the readings), `ServerError` where the connection is gone
-        or the answer late: then `reconnect`.
+        Raises `ObservationError` where the server refuses the observation, `ServerBusy` where too
+        many wait (the connection stays, and the server has taken the readings), `ServerError` where
+        the connection is lost or the answer is late: then `reconnect`.
         """
-        told = {} if self._reset is None else {"reset": self._reset}
-        message = wire.pack({**observation, **told})
+        reset = {} if self._reset is None else {"reset": self._reset}
+        message = wire.pack({**observation, **reset})
         try:
-            answer = wire.unpack(self._said(message))
+            answer = wire.unpack(self._receive(message))
         except ServerBusy:
-            self._reset = None  # it is taken with the readings
+            self._reset = None  # The server has taken it with the readings.
             raise
         self._reset = None
         if "feature_key" in answer:
@@ -81,7 +81,7 @@ class PolicyClient(AbstractContextManager["PolicyClient"]):
         return answer
 
     def reset(self, seed: int | None = None) -> None:
-        """Begin a new episode with the next observation; `seed` is of what the policy draws."""
+        """Begin a new episode with the next observation; `seed` seeds the policy's samples."""
         self._reset = True if seed is None else seed
 
     def close(self) -> None:
@@ -113,8 +113,8 @@ class PolicyClient(AbstractContextManager["PolicyClient"]):
                 "stages.serve, and give the address that it prints"
             ) from None
 
-    def _said(self, message: bytes | None = None) -> bytes:
-        """What the server says next, to this message; what it says in words is an error."""
+    def _receive(self, message: bytes | None = None) -> bytes:
+        """The server's next message, after sending this one; a text is an error."""
         if self._connection is None:
             raise ServerError(f"{self._url}: not connected; call reconnect")
         try:
@@ -122,7 +122,7 @@ class PolicyClient(AbstractContextManager["PolicyClient"]):
                 self._connection.send(message)
             answer = self._connection.recv(self._timeout_s)
         except TimeoutError:
-            self.close()  # a late answer would be taken for the next
+            self.close()  # A late answer would be taken for the next one.
             raise ServerError(
                 f"{self._url}: expected an answer within {self._timeout_s:g} s, found none, and "
                 "left. Stop the robot; then reconnect, with a longer timeout_s if the model is slow"
@@ -147,9 +147,9 @@ class PolicyClient(AbstractContextManager["PolicyClient"]):
 
 
 def refuse_other_robot(robot: Mapping[str, Any], metadata: Mapping[str, Any]) -> None:
-    """Raise `CheckpointMismatch` where a robot is not the one that a policy was trained on.
+    """Raise `CheckpointMismatch` where a policy was trained on another robot than this.
 
-    Only what its description says is compared; it may have more views than the policy looks at.
+    Only the entries of the description are compared; the robot may have further views.
     """
     streams = metadata["streams"]
     trained = {"views": streams["views"], "action_hz": metadata["action_hz"]}

@@ -1,11 +1,11 @@
 """The head of a checkpoint, all but the vision-language model, as files that run without this code.
 
-`head.onnx` for ONNX Runtime, `head.pt2` for `torch.export.load`, and `receipt.json`, which says
-what goes in and comes out and how far each file is from the policy. Normalisation is inside:
-physical units in, physical units out. The inputs are the fields of `Observation` that the policy
-looks at and, where it draws, the standard normal `noise` that it draws, so that a file is a
-function. Samplers have their loop unrolled. The batch is of any size, windows are those of the
-params. Guides (`rtc`) differentiate the head, which neither format does.
+`head.onnx` is for ONNX Runtime, `head.pt2` for `torch.export.load`; `receipt.json` has their inputs
+and outputs, and how far each is from the policy. Normalisation is inside: physical units in and
+out. The inputs are the fields of `Observation` that the policy looks at and, where it samples, the
+standard normal `noise`, so that a file is a function; the sampler's loop is unrolled. The batch is
+of any size, windows are those of the params. Guides (`rtc`) differentiate the head, which neither
+format does.
 """
 
 import json
@@ -40,13 +40,14 @@ RECEIPT, CONTRACT = "receipt.json", "contract.json"
 EXPORT = OutputKind("an exported head", lambda folder: (folder / RECEIPT).is_file())
 
 TOLERANCE = 1e-4
-"""Most that a float32 file may be off, in training std of the action. Every runtime sums in another
-order: sums of n terms then differ by about sqrt(n) 6e-8 of their size, which for the widest layers
-(n of some thousands) is 3e-6 a layer, and a few 1e-5 behind some ten layers and the steps of a
-sampler. What was translated wrongly is off by far more."""
+"""Largest deviation of a file, in training std of the action. Every runtime sums in another order:
+sums of n terms then differ by about sqrt(n) 6e-8 of their size, which for the widest layers (n of
+some thousands) is 3e-6 a layer, and a few 1e-5 behind some ten layers and the steps of a sampler. A
+wrong translation is off by far more."""
 
 _PACKAGES = ("onnx", "onnxscript", "onnxruntime")
-_LOOKED_AT = {
+_INPUTS = {
+    "features": ("", "of the vision-language model, row by slot"),
     "slot_valid": ("", "which slots of the features are real"),
     "feature_age": ("s", "since the newest frame that the features have seen"),
     "view_age": ("s", "since the frame of each view that they have seen, NaN of a missing view"),
@@ -59,7 +60,7 @@ Runner = Callable[[Inputs], NDArray[np.float32]]
 
 
 class Head(nn.Module):
-    """A policy's `act` as a function of tensors alone, each optional as the policy needs it."""
+    """A policy's `act` as a function of the tensors that it looks at."""
 
     def __init__(self, policy: Policy) -> None:
         super().__init__()
@@ -81,7 +82,7 @@ class Head(nn.Module):
         noise: Tensor | None = None,
     ) -> Chunk:
         """Chunks (batch, horizon, action) in physical units; `noise` is (batch, draw, …)."""
-        # The fields are named here, for a graph's inputs have the names of these arguments.
+        # Each field is named here, because the inputs of a graph take the names of arguments.
         seen = cast(Observation, SimpleNamespace(**locals()))
         return self.policy.act(seen, None if noise is None else iter(noise.unbind(1)))
 
@@ -89,10 +90,10 @@ class Head(nn.Module):
 def export_head(
     checkpoint: PolicyCheckpoint, folder: str, params: ExportParams, say: Callable[[str], None]
 ) -> dict[str, Any]:
-    """Write the head of `checkpoint`, which lies in `folder`, to `params.output`; the receipt.
+    """Write the head of `checkpoint`, which lies in `folder`, to `params.output`; its receipt.
 
-    Nothing is put in place unless every file holds parity with the policy. Raises `NumericsError`
-    where one does not, `ConfigError` where packages are missing.
+    Nothing is written unless every file agrees with the policy. Raises `NumericsError` where one
+    does not, `ConfigError` where packages are missing.
     """
     check_packages(params)
     policy = checkpoint.policy()
@@ -107,22 +108,14 @@ def export_head(
         say("tracing the head")
         few = {name: value[:2] for name, value in given["random"].items()}  # the file keeps them
         program = trace(head, few)
-        tolerances: dict[Path, float] = {}
         if "torch" in params.formats:
-            tolerances[path := place / "head.pt2"] = TOLERANCE
-            torch.export.save(program, path, extra_files={CONTRACT: json.dumps(contract)})
+            path, extra = place / "head.pt2", {CONTRACT: json.dumps(contract)}
+            torch.export.save(program, path, extra_files=extra)
+            files[path.name] = _compare(path, torch_runner(path), head, given, checkpoint)
         if "onnx" in params.formats:
             say("translating it to ONNX")
-            tolerances[path := place / "head.onnx"] = TOLERANCE
-            write_onnx(program, few, path, contract, params.opset)
-            if params.int8:
-                tolerances[int8 := place / "head.int8.onnx"] = params.int8_tolerance
-                with _quietly():
-                    quantization: Any = import_module("onnxruntime.quantization")
-                    quantization.quantize_dynamic(path, int8)  # activations: as they come
-        say("comparing the files with the policy")
-        for path, tolerance in tolerances.items():
-            files[path.name] = _judged(path, head, given, checkpoint, tolerance)
+            write_onnx(program, few, path := place / "head.onnx", contract, params.opset)
+            files[path.name] = _compare(path, onnx_runner(path), head, given, checkpoint)
         write_document(place / RECEIPT, contract | {"files": files})
 
     replace_folder(params.output, write, EXPORT)
@@ -146,7 +139,7 @@ def check_packages(params: ExportParams) -> None:
 
 
 def trace(head: Head, given: Inputs) -> ExportedProgram:
-    """The head as a graph over any batch; where it was traced from is not in it."""
+    """The head as a graph over any batch, without the places in the code that it comes from."""
     batch = Dim("batch", min=1, max=65536)
     shapes = {name: {0: batch} for name in given}
     with _quietly(), torch.no_grad():
@@ -157,15 +150,15 @@ def trace(head: Head, given: Inputs) -> ExportedProgram:
 
 
 def describe(checkpoint: PolicyCheckpoint, folder: str, given: Inputs) -> dict[str, Any]:
-    """What goes in and comes out, and what the head is: all of the receipt but the files."""
-    channels = checkpoint.source["streams"]["action"]
+    """The inputs, the outputs and what the head is: all of the receipt but the files."""
+    action = checkpoint.source["streams"]["action"]
     outputs = {
         "name": "actions",
         "shape": ["batch", *chunk_size(checkpoint)],
         "dtype": "float32",
-        "channels": channels["names"],
-        "units": channels["units"],
-        "kind": channels["kind"],
+        "channels": action["names"],
+        "units": action["units"],
+        "kind": action["kind"],
     }
     return {
         "checkpoint": folder,
@@ -184,25 +177,25 @@ def describe(checkpoint: PolicyCheckpoint, folder: str, given: Inputs) -> dict[s
 def write_onnx(
     program: ExportedProgram, given: Inputs, path: Path, contract: Mapping[str, Any], opset: int
 ) -> None:
-    """Write an ONNX file, with the contract among its metadata."""
+    """Write an ONNX file with the contract among its metadata."""
     with _quietly():
         written: Any = torch.onnx.export(
             program,
             kwargs=dict(given),
             dynamo=True,
             verbose=False,
-            optimize=False,  # ONNX Runtime does as much when it loads; here it takes minutes
+            optimize=False,  # ONNX Runtime does it when it loads the file; here it takes minutes
             output_names=["actions"],
             opset_version=opset,
         )
     for node in written.model.graph.all_nodes():
-        node.metadata_props.clear()  # where each was traced from: most of the file otherwise
+        node.metadata_props.clear()  # places in the code, most of the file otherwise
     written.model.metadata_props[CONTRACT] = json.dumps(contract)
     written.save(path, external_data=False)
 
 
 def onnx_session(path: Path, threads: int = 0) -> Any:
-    """The session of an ONNX file on the CPU; on all cores with 0 threads."""
+    """A session of an ONNX file on the CPU; 0 threads mean all cores."""
     runtime: Any = import_module("onnxruntime")
     options = runtime.SessionOptions()
     options.intra_op_num_threads, options.log_severity_level = threads, 3
@@ -210,51 +203,45 @@ def onnx_session(path: Path, threads: int = 0) -> Any:
 
 
 def onnx_runner(path: Path) -> Runner:
-    """What runs an ONNX file."""
+    """Runs an ONNX file."""
     session = onnx_session(path)
     return lambda given: session.run(None, {name: v.numpy() for name, v in given.items()})[0]
 
 
 def torch_runner(path: Path) -> Runner:
-    """What runs a `torch.export` file."""
+    """Runs a `torch.export` file."""
     with _quietly():
         module: Any = torch.export.load(path).module()
     return lambda given: module(**given).numpy()
 
 
-def _judged(
-    path: Path,
-    head: Head,
-    given: Mapping[str, Inputs],
-    checkpoint: PolicyCheckpoint,
-    tolerance: float,
+def _compare(
+    path: Path, run: Runner, head: Head, given: Mapping[str, Inputs], checkpoint: PolicyCheckpoint
 ) -> dict[str, Any]:
-    """What the receipt says of a file. Raises `NumericsError` where it is off by too much."""
-    run = torch_runner(path) if path.suffix == ".pt2" else onnx_runner(path)
+    """The receipt of a file. Raises `NumericsError` where it is too far from the policy."""
     off: dict[str, dict[str, Any]] = {}
     for name, inputs in given.items():
         furthest = np.abs(run(inputs) - head(**inputs).numpy().astype(np.float64)).max(axis=(0, 1))
         std = float((furthest / checkpoint.normalization.action.scale).max())
         off[name] = {"std": std, "physical": furthest.tolist()}
-        if not std <= tolerance:  # nor where one of them is not a number
+        if not std <= TOLERANCE:  # a NaN is too far, too
             raise NumericsError(
-                f"{path.name}: expected at most {tolerance:g} training std of the action off the "
+                f"{path.name}: expected at most {TOLERANCE:g} training std of the action off the "
                 f"policy, found {std:.2g} over {name} inputs (by channel: "
                 f"{', '.join(f'{value:.2g}' for value in furthest)}). Nothing was written: leave "
-                "this format out (export.formats, export.int8), raise export.int8_tolerance for "
-                "int8, or try other versions of what writes it."
+                "this format out (export.formats), or try other versions of the packages."
             )
     return {
         "sha256": sha256_of(path),
         "bytes": path.stat().st_size,
-        "tolerance_std": tolerance,
+        "tolerance_std": TOLERANCE,
         "deviation": off,
     }
 
 
 @contextmanager
 def _quietly() -> Generator[None]:
-    """Without what torch and the packages log of their own parts, which is slow to write too."""
+    """Silence warnings and logs of torch and the packages; writing them is slow, too."""
     logging.disable(logging.WARNING)
     try:
         with warnings.catch_warnings():
@@ -265,17 +252,12 @@ def _quietly() -> Generator[None]:
 
 
 def _input(checkpoint: PolicyCheckpoint, name: str, value: Tensor) -> dict[str, Any]:
-    """A line of the receipt about an input."""
-    described: dict[str, Any] = {
-        "name": name,
-        "shape": ["batch", *value.shape[1:]],
-        "dtype": str(value.dtype).removeprefix("torch."),
-    }
+    """The entry of an input in the receipt."""
+    dtype = str(value.dtype).removeprefix("torch.")
+    entry: dict[str, Any] = {"name": name, "shape": ["batch", *value.shape[1:]], "dtype": dtype}
     streams = checkpoint.source["streams"]
     if name in AGES:  # sensor, state
-        return described | {"channels": streams[name]["names"], "units": streams[name]["units"]}
-    if name == "features":
-        return described | {"unit": "", "meaning": "of the vision-language model, row by slot"}
-    unit, meaning = _LOOKED_AT.get(name) or _LOOKED_AT[name.rpartition("_")[2]]
+        return entry | {"channels": streams[name]["names"], "units": streams[name]["units"]}
+    unit, meaning = _INPUTS.get(name) or _INPUTS[name.rpartition("_")[2]]
     of_views = {"channels": streams["views"]} if name == "view_age" else {}
-    return described | {"unit": unit, "meaning": meaning} | of_views
+    return entry | {"unit": unit, "meaning": meaning} | of_views

@@ -1,4 +1,4 @@
-"""What an exported head and its policy are compared over: observations, and noise to draw."""
+"""The inputs over which an exported head is compared with its policy."""
 
 from collections.abc import Iterator
 from types import SimpleNamespace
@@ -15,7 +15,7 @@ from pipeline.policy.observation import AGES, VALIDITY
 from pipeline.policy.policy import Policy
 
 Inputs = dict[str, Tensor]
-"""Tensors by the fields of `Observation` that a policy looks at, in their order, and `noise`."""
+"""Tensors of the fields of `Observation` that a policy looks at, in their order, and `noise`."""
 
 _ROWS = 16
 _OLD_S = 30.0
@@ -25,7 +25,7 @@ _TURN = {"deg": 5.0, "rad": 0.1, "rotation": 5.0}
 
 
 def golden_inputs(checkpoint: PolicyCheckpoint, policy: Policy) -> dict[str, Inputs]:
-    """The inputs that the files are judged over: `random` and, where there are some, `golden`."""
+    """`random` inputs and, where the checkpoint has golden rows, `golden` ones."""
     given = {"random": random_inputs(checkpoint, policy, _ROWS)}
     rows = checkpoint.golden
     if rows and "features" in policy.encoders:
@@ -37,9 +37,10 @@ def golden_inputs(checkpoint: PolicyCheckpoint, policy: Policy) -> dict[str, Inp
 
 
 def random_inputs(checkpoint: PolicyCheckpoint, policy: Policy, rows: int, seed: int = 0) -> Inputs:
-    """Observations drawn from the statistics, on the CPU, and the noise for them.
+    """Random observations about the training mean, on the CPU, and the noise for them.
 
-    Windows are full, half full, of one reading or missing, features old, slots and views missing.
+    Windows are full, half full, of one reading or missing; features are old, slots and views are
+    missing.
     """
     rng = np.random.default_rng(seed)
     given: dict[str, NDArray[Any]] = {}
@@ -68,7 +69,7 @@ def random_inputs(checkpoint: PolicyCheckpoint, policy: Policy, rows: int, seed:
 
 
 def count_draws(policy: Policy, given: Inputs) -> int:
-    """How often the policy asks for noise in one act."""
+    """How often the policy draws noise in one act."""
     asked: list[Tensor] = []
     rows = len(next(iter(given.values())))
 
@@ -89,7 +90,7 @@ def chunk_size(built: PolicyCheckpoint | Policy) -> tuple[int, int]:
 def _drawn(
     checkpoint: PolicyCheckpoint, stream: str, rows: int, rng: np.random.Generator
 ) -> NDArray[np.float64]:
-    """Values (row, slot or reading, channel) of a stream about its training mean."""
+    """Random values (row, slot or reading, channel) of a stream about its training mean."""
     statistics, shape = getattr(checkpoint.normalization, stream), checkpoint.shape
     lengths = {"sensor": checkpoint.params.sensor_window, "state": checkpoint.params.state_window}
     spread = statistics.std

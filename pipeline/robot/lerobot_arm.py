@@ -1,12 +1,11 @@
-"""A robot with the interface of LeRobot's, as the control loop drives it; lerobot is not imported.
+"""Drives a robot with LeRobot's interface from the control loop; lerobot is not imported.
 
-LeRobot's `Robot` (github.com/huggingface/lerobot, src/lerobot/robots/robot.py) gives one flat dict
-an observation, a float a motor (`shoulder_pan.pos`) and an RGB image a camera, takes such a dict as
-the action, and gives back what it really sent. `observation_features` and `action_features` name
-both without a connection. It says no times. Motors are read within a call, and their readings have
-the time at which it began. Cameras grab on threads of their own, so an image was taken before, by
-up to the period of its camera: `camera_latency_s` says how long, and what is not said is missing
-from the ages of frames and features.
+LeRobot's `Robot` (github.com/huggingface/lerobot, src/lerobot/robots/robot.py) observes as one flat
+dict with a float a motor (`shoulder_pan.pos`) and an RGB image a camera, takes such a dict as the
+action, and returns the action that it really sent. `observation_features` and `action_features`
+name both without a connection. It gives no times. Motors are read within a call, so readings have
+the time at which the call began. Cameras grab on threads of their own, so an image is older, by up
+to the period of its camera: set `camera_latency_s`, or frames and features seem that much younger.
 """
 
 import threading
@@ -21,18 +20,18 @@ from pipeline.base.errors import CheckpointMismatch
 
 _DELTA, _PLACE = "delta_", ".pos"
 _PORT_S = 0.2
-"""How long a stop waits for another call that keeps the robot's port."""
+"""How long a stop waits for another call that holds the robot's port."""
 _ROWS = 8
-"""Of an image every eighth row is compared; the noise of a camera changes each."""
+"""Every so many rows of an image are compared; a camera's noise changes each row."""
 
 
 class LeRobotArm:
     """A LeRobot-style robot for a policy with this metadata.
 
-    A channel of the policy is the motor of its own name, with or without `.pos`, and of an action
-    with or without a leading `delta_`, or the one that `motors` names for it; a view is the camera
-    of its own name, or the one that `cameras` names. Numbers are handed through in the policy's
-    units: the robot must be configured for these.
+    A channel of the policy is the motor of that name, with or without `.pos` and, for an action, a
+    leading `delta_`; or the motor that `motors` names for it. A view is the camera of that name, or
+    the one that `cameras` names. Numbers pass through in the policy's units: configure the robot
+    for them.
     """
 
     def __init__(
@@ -47,10 +46,10 @@ class LeRobotArm:
     ) -> None:
         """`metadata` is the policy's; `cameras` are by view, `motors` by channel.
 
-        Raises `CheckpointMismatch`, naming both sides, where the robot lacks a motor or a camera
-        of the policy's, has a motor that the policy would leave alone, or does not observe one that
-        is to move by a delta; where `cameras` or `motors` name none of the policy's; and for
-        actions that are neither places nor deltas.
+        Raises `CheckpointMismatch`, which names both sides, where the robot lacks a motor or camera
+        of the policy, has a motor that the policy does not move, or does not observe a motor that
+        moves by deltas; where `cameras` or `motors` name something that the policy does not have;
+        and for actions that are neither absolute nor deltas.
         """
         self._robot, self._clock_s, self._say = robot, clock_s, say
         self._camera_latency_s = camera_latency_s
@@ -82,7 +81,7 @@ class LeRobotArm:
         self._sent: dict[str, float] = {}
 
     def observe(self) -> dict[str, NDArray[Any]]:
-        """Ask the robot, once a tick: `state` (1, dim), `state_time` (1,) and `time` (1,), s."""
+        """Observe once a tick: `state` (1, dim), `state_time` (1,) and `time` (1,), s."""
         self._time_s = self._clock_s()
         with self._port:
             self._seen = self._robot.get_observation()
@@ -94,9 +93,9 @@ class LeRobotArm:
         return observed
 
     def frames(self) -> dict[str, tuple[float, NDArray[np.uint8]]]:
-        """By view, what came with the newest observation: when it was taken, s, and the image, RGB.
+        """By view, the frame of the newest observation: when it was taken, s, and RGB.
 
-        An image that has not changed keeps its time, so that a camera that hangs becomes old.
+        An image that has not changed keeps its time, so that the frame of a stuck camera ages.
         """
         taken_s = self._time_s - self._camera_latency_s
         frames: dict[str, tuple[float, NDArray[np.uint8]]] = {}
@@ -110,9 +109,9 @@ class LeRobotArm:
         return frames
 
     def act(self, action: NDArray[np.floating[Any]]) -> None:
-        """Send an action (action_dim,); what is to move is added to where it was last sent.
+        """Send an action (action_dim,); a delta is added to where the motor was last sent.
 
-        The first time to where it is; and where the robot sent less, as one that clips, to that.
+        The first delta is added to where the motor is. A robot that clips returns where it sent it.
         """
         goal = dict(zip(self._action, map(float, action), strict=True))
         for key, moving in zip(self._action, self._moving, strict=True):
@@ -122,9 +121,10 @@ class LeRobotArm:
             self._send(goal)
 
     def stop(self, reason: str) -> None:
-        """Hold the place where the robot was last seen: what blocks is not asked first.
+        """Hold the place of the newest observation, without observing again, which may block.
 
-        From any thread. Where another call keeps the port it is sent all the same, and said.
+        From any thread. Where another call holds the port, the stop is sent all the same, and says
+        so.
         """
         free = self._port.acquire(timeout=_PORT_S)
         try:
@@ -134,8 +134,8 @@ class LeRobotArm:
             if free:
                 self._port.release()
             else:
-                said = f"LeRobotArm: stop ({reason}) was sent while another call kept the port for"
-                self._say(f"{said} {_PORT_S:g} s: see that the robot stands still")
+                sent = f"LeRobotArm: stop ({reason}) was sent while another call kept the port for"
+                self._say(f"{sent} {_PORT_S:g} s: see that the robot stands still")
 
     def _send(self, goal: dict[str, float]) -> None:
         sent = self._robot.send_action(dict(goal))
@@ -145,11 +145,11 @@ class LeRobotArm:
 def describe(
     robot: Any, cameras: Mapping[str, str] | None = None, motors: Mapping[str, str] | None = None
 ) -> dict[str, Any]:
-    """What `PolicyClient(robot=...)` compares of a robot that is told places, as LeRobot's are.
+    """The description of a LeRobot robot for `PolicyClient(robot=...)`, with absolute actions.
 
-    Motors in the robot's order and cameras, by the names that `motors` and `cameras` give them. For
-    a policy of deltas put its `action` and `action_kind` in place; add `state_units` and
-    `action_units` where the training data had any.
+    Motors stand in the robot's order, under the names that `motors` and `cameras` give. For a
+    policy of deltas replace `action` and `action_kind`; add `state_units` and `action_units` where
+    the training data had any.
     """
     own = {key: name for name, key in {**(motors or {}), **(cameras or {})}.items()}
     images = [key for key, kind in robot.observation_features.items() if isinstance(kind, tuple)]
@@ -164,7 +164,7 @@ def describe(
 def _matched(
     names: Sequence[str], given: Mapping[str, str], features: Mapping[str, Any]
 ) -> list[str]:
-    """The robot's key for each name of the policy's."""
+    """The robot's key for each name of the policy."""
     keys: list[str] = []
     for name in names:
         plain = name.removeprefix(_DELTA)

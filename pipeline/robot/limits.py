@@ -1,7 +1,7 @@
-"""How far, how fast, where and how hard a robot may go, from a YAML file. Numpy only.
+"""The limits of a robot's motion, workspace and force, from a YAML file. Numpy only.
 
-Limits of motion (`step`, `speed`, `acceleration`) are kept on what is sent, before it is sent;
-those of the workspace and of force on what is measured, each tick before anything is sent.
+Limits of motion (`step`, `speed`, `acceleration`) apply to each action before it is sent; those of
+workspace and force apply to the readings, each tick before anything is sent.
 """
 
 from collections.abc import Mapping
@@ -22,20 +22,20 @@ Vector = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class _Bound:
-    """The most that some channels may move together within a tick, of one kind of limit."""
+    """How far some channels may move together in a tick, by one kind of limit."""
 
     kind: str
     name: str
     channels: list[int]
     most: float
     per_tick: float
-    """`most` as a motion in a tick, of an acceleration as its change from tick to tick."""
+    """`most` as the motion of a tick, or, for an acceleration, its change from tick to tick."""
     clips: bool
 
 
 @dataclass(frozen=True)
 class _Range:
-    """Between which values a channel's readings stay."""
+    """The lowest and the highest allowed reading of a channel."""
 
     stream: str
     name: str
@@ -45,11 +45,11 @@ class _Range:
 
 
 class Limits:
-    """The limits of a file for a robot of this metadata, and what was sent last.
+    """The limits of a file for a robot of this metadata, and the action that was sent last.
 
-    `hz` is how many actions a second are sent. Raises `ConfigError` for a channel that the robot
-    has not, and for a motion limit on a channel that says where to be and that the state has not:
-    how far its first action leads could not be told.
+    `hz` is the number of actions a second. Raises `ConfigError` for a channel that the robot does
+    not have, and for a motion limit on an absolute channel that the state does not have: nobody
+    knows how far its first action leads.
     """
 
     def __init__(self, file: LimitsFile, metadata: Mapping[str, Any], hz: float) -> None:
@@ -62,7 +62,7 @@ class Limits:
         self._per_tick = np.where(self._goes_on, 1 / hz, 1.0)
         self._state_of = [self._place("state", name) for name in self._names]
         self.clipped = 0
-        """Ticks in which less was sent than was wanted."""
+        """Ticks in which an action was cut short."""
         rates = {"step": 1.0, "speed": hz, "acceleration": hz * hz}
         self._bounds = [
             bound
@@ -83,7 +83,7 @@ class Limits:
 
     @classmethod
     def read(cls, path: Path, metadata: Mapping[str, Any], hz: float) -> "Limits":
-        """Those of a YAML file. Raises `ConfigError` that names file and key."""
+        """The limits of a YAML file. Raises `ConfigError` that names file and key."""
         file = load_section(path, LimitsFile)
         try:
             return cls(file, metadata, hz)
@@ -92,12 +92,12 @@ class Limits:
 
     @property
     def streams(self) -> set[str]:
-        """Whose readings it needs."""
+        """The streams whose readings these limits need."""
         follows = any(self._absolute[bound.channels].any() for bound in self._bounds)
         return {bound.stream for bound in self._ranges} | ({"state"} if follows else set())
 
     def reset(self) -> None:
-        """The robot stands still, where its next reading says."""
+        """Begin again with a robot that stands still where its next reading says."""
         self._reference = np.full(len(self._names), np.nan)
         self._moved, self._sent = np.zeros(len(self._names)), False
 
@@ -111,19 +111,19 @@ class Limits:
             low, high = float(values.min()), float(values.max())
             if low < bound.low or high > bound.high:
                 kind = StopKind.WORKSPACE if bound.stream == "state" else StopKind.FORCE
-                found = low if low < bound.low else high
+                beyond = low if low < bound.low else high
                 within = f"{bound.low:g} to {bound.high:g}"
-                raise SafeStop(kind, f"{bound.name} measured at {found:g}, allowed are {within}")
+                raise SafeStop(kind, f"{bound.name} measured at {beyond:g}, allowed are {within}")
         if not self._sent and len(observed.get("state", ())):
             newest = observed["state"][-1]
             held = [np.nan if at is None else float(newest[at]) for at in self._state_of]
             self._reference = np.array(held)
 
     def allow(self, action: Vector) -> Vector:
-        """What of an action (action,) may be sent; this very array where all of it may.
+        """The action (action,) within the limits; the same array where it is within them already.
 
-        Raises `SafeStop` for a motion beyond a limit that stops, or beyond any limit once others
-        have clipped it.
+        Raises `SafeStop` for a motion beyond a limit that stops, or beyond any limit after another
+        has clipped it.
         """
         absolute, at = self._absolute, self._reference
         wanted = np.where(absolute, action - at, action * self._per_tick)
@@ -141,7 +141,7 @@ class Limits:
         return action
 
     def stood_still(self) -> None:
-        """Nothing was sent for a tick or more; what was told a velocity has gone on with it."""
+        """Note that nothing was sent for a tick or more; velocities went on meanwhile."""
         self._moved = np.where(self._goes_on, self._moved, 0.0)
 
     def _bounded(self, moved: Vector, bound: _Bound, clips: bool) -> Vector:
@@ -153,11 +153,9 @@ class Limits:
         if not length > bound.per_tick * (1 + 1e-6):
             return moved
         if not clips:
-            found = bound.most * length / bound.per_tick
-            raise SafeStop(
-                StopKind.LIMIT,
-                f"{bound.kind} of {bound.name} would be {found:.4g}, at most {bound.most:g}",
-            )
+            size = bound.most * length / bound.per_tick
+            why = f"{bound.kind} of {bound.name} would be {size:.4g}, at most {bound.most:g}"
+            raise SafeStop(StopKind.LIMIT, why)
         clipped = moved.copy()
         clipped[bound.channels] = before[bound.channels] + change * (bound.per_tick / length)
         return clipped

@@ -1,9 +1,9 @@
-"""One robot's control loop: it says what is due, and counts what came of it. Numpy only.
+"""One robot's control loop: what is due in a tick, and the action of the tick. Numpy only.
 
-It has no clock but its ticks, so that a rollout and a robot in real time run the same loop. In each
-tick whoever drives it calls, in this order: `begin_tick`; where `frames_due`, `pass_began`, and
-`pass_ended` once features of these frames are there; where `chunk_due`, `ask`, and `plan` with the
-chunk that was answered, at once or ticks later; then `action`.
+Its only clock is its ticks, so that a rollout and a robot in real time run the same loop. In each
+tick the driver calls, in this order: `begin_tick`; where `frames_due`, `pass_began`, and
+`pass_ended` once the features of these frames are there; where `chunk_due`, `ask`, and `plan` with
+the answered chunk, at once or ticks later; then `action`.
 """
 
 from enum import StrEnum
@@ -39,7 +39,7 @@ class StopKind(StrEnum):
 
 
 class SafeStop(Exception):
-    """The robot is to stand still from here on; the message is the reason."""
+    """The robot has to stand still from now on; the message is the reason."""
 
     def __init__(self, kind: StopKind, reason: str) -> None:
         super().__init__(reason)
@@ -47,20 +47,20 @@ class SafeStop(Exception):
 
 
 class ControlLoop:
-    """The loop of a policy; `uses_features` where it needs the model, `reuse` ticks a pass."""
+    """The loop of a policy; `uses_features` where it needs the model, one pass in `reuse` ticks."""
 
     def __init__(self, executor: Executor, reuse: int, uses_features: bool) -> None:
         self.executor, self._reuse, self._uses_features = executor, reuse, uses_features
         self.reset()
 
     def reset(self) -> None:
-        """Forget all, for the next episode."""
+        """Begin the next episode."""
         self.executor.reset()
         self._tick, self._pass_began, self._asked = -1, -self._reuse, -1
         self._under_way = False
 
     def begin_tick(self) -> None:
-        """Begin a tick: what is due is asked anew."""
+        """Begin a tick."""
         self._tick += 1
 
     @property
@@ -70,40 +70,40 @@ class ControlLoop:
         return self._uses_features and not self._under_way and waited
 
     def pass_began(self) -> None:
-        """The model looks at frames of this tick."""
+        """Note that a pass of the model began on frames of this tick."""
         self._pass_began, self._under_way = self._tick, True
 
     def pass_ended(self) -> None:
-        """The features of the pass that began last are there."""
+        """Note that the features of the last pass are there."""
         self._under_way = False
 
     @property
     def chunk_due(self) -> bool:
-        """Whether the next chunk is to be asked for; never from `ask` to `plan` or `refused`."""
+        """Whether to ask for the next chunk; never between `ask` and `plan` or `refused`."""
         return self.executor.due
 
     def ask(self) -> PlanGuide | None:
-        """The chunk that is due is asked for with what is known now; what it is to continue."""
+        """Note that the chunk is asked for now; the plan that it is to continue."""
         self._asked = self._tick
         return self.executor.begin()
 
     def refused(self) -> None:
-        """What `ask` asked is not answered: nobody looks at the frames that went with it."""
+        """Note that the last question is not answered, nor its frames looked at."""
         self.executor.refused()
         if self._pass_began == self._asked:
             self._pass_began, self._under_way = self._asked - self._reuse, False
 
     def plan(self, chunk: NDArray[np.float32]) -> None:
-        """Take the chunk (horizon, action) that `ask` was for, in physical units.
+        """Take the answered chunk (horizon, action), in physical units.
 
-        Raises `SafeStop` for one that is not all numbers.
+        Raises `SafeStop` for a chunk with a NaN or an infinity.
         """
         if not np.isfinite(chunk).all():
             raise SafeStop(StopKind.NOT_A_NUMBER, "the policy's action is not a number")
         self.executor.plan(chunk)
 
     def action(self) -> NDArray[np.float64] | None:
-        """What the robot is to do in this tick; None, stand still, until the first chunk is there.
+        """The action of this tick; None, stand still, before the first chunk.
 
         Raises `SafeStop` where the plan is used up before the next chunk has come.
         """

@@ -1,4 +1,4 @@
-"""What a robot says, checked: a mapping from outside becomes an `Observation`, or is refused.
+"""A robot's observations, checked: a mapping from outside becomes a `RobotObservation`.
 
 Each refusal names the field, what was expected, what was found, and what to mend.
 """
@@ -25,15 +25,15 @@ STREAMS: Final = ("state", "sensor")
 
 @dataclass(frozen=True)
 class RobotObservation:
-    """One observation of a robot, as it is known to be good."""
+    """One checked observation of a robot."""
 
     readings: Mapping[str, NDArray[Any]]
-    """What `RobotMemory.sense` takes: `time` (1,), and of each stream that came, its readings
-    (reading, channel) in float32 and their times (reading,) in float64."""
+    """For `RobotMemory.sense`: `time` (1,), and of each stream that came, its readings (reading,
+    channel) in float32 and their times (reading,) in float64."""
     frames: Mapping[str, NDArray[np.uint8]]
     """RGB (height, width, 3) of each view that came, in the policy's order."""
     frame_time_s: NDArray[np.float64]
-    """(view,) of all views of the policy; NaN of a missing one."""
+    """(view,) over all views of the policy; NaN of a missing one."""
     prompt: str | None
     reset: bool
     seed: int | None
@@ -41,14 +41,14 @@ class RobotObservation:
 
     @property
     def time_s(self) -> float:
-        """The robot's clock when it was made."""
+        """The time on the robot's clock."""
         return float(self.readings["time"][0])
 
 
 class ObservationReader:
-    """Reads the observations of one robot, which follow one another, for the policy of `metadata`.
+    """Reads one robot's observations, in order, for the policy of `metadata`.
 
-    One that is refused leaves no trace.
+    A refused observation changes nothing.
     """
 
     def __init__(self, metadata: Mapping[str, Any]) -> None:
@@ -67,8 +67,8 @@ class ObservationReader:
     def read(self, given: Any) -> RobotObservation:
         """The observation of these fields. Raises `ObservationError`.
 
-        Without `time` it is of the newest time that it brings, else of this machine's clock now. A
-        frame or a single reading without its time is of `time`.
+        `time` defaults to the newest time among the fields, else to this machine's clock. A frame
+        or a single reading without a time has `time`.
         """
         if not isinstance(given, Mapping):
             raise ObservationError(f"expected fields by name, found {type(given).__name__}")
@@ -99,7 +99,7 @@ class ObservationReader:
         return observation
 
     def _values(self, given: Mapping[str, Any]) -> dict[str, NDArray[Any]]:
-        """The readings (reading, channel) of each stream that came, and frames as one reading."""
+        """The readings (reading, channel) of each stream that came; a frame is one reading."""
         values: dict[str, NDArray[Any]] = {}
         for name in self._clocks:
             if name in given and name in self._widths:
@@ -130,7 +130,7 @@ class ObservationReader:
     def _follow(
         self, before: Mapping[str, float], times: Mapping[str, NDArray[np.float64]]
     ) -> Mapping[str, float]:
-        """The newest times of `before` and of these, `time` first, which must follow them."""
+        """The newest times of `before` and `times`, which must follow one another."""
         newest_s, now_s = dict(before), times["time"][0]
         for name, own in times.items():
             after = before.get(name, -np.inf)
@@ -163,9 +163,9 @@ class ObservationReader:
 def _numbers(
     name: str, value: Any, axes: Sequence[int | str], dtype: type[np.floating[Any]]
 ) -> NDArray[Any]:
-    """The value as finite numbers of this dtype; an axis that has only a name is of any length.
+    """The value as finite numbers of this dtype; an axis with only a name has any length.
 
-    Where one number is expected, it may stand alone.
+    A single number may come without an axis.
     """
     try:
         array = np.asarray(value)
@@ -208,7 +208,7 @@ def _prompt(value: Any) -> str | None:
 
 
 def _reset(value: Any) -> tuple[bool, int | None]:
-    """Whether a new episode begins, and the seed of what is drawn in it."""
+    """Whether a new episode begins, and the seed of its samples."""
     if isinstance(value, bool | np.bool_):
         return bool(value), None
     if isinstance(value, int | np.integer) and 0 <= value < LARGEST_SEED:

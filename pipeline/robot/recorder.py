@@ -1,8 +1,7 @@
-"""What happens on a robot, recorded while it runs: cheap in the loop, written on a thread.
+"""Records a run on a robot: the loop hands over copies and goes on, a thread writes them.
 
-The loop hands over copies and goes on; a thread of its own encodes images and appends to the logs
-that `run_recording` makes a recording of. A recording that fails never stops the robot: `failed`
-says why, and `finish` raises it.
+The thread encodes images and appends to the logs from which `run_recording` makes a recording. A
+recording that fails never stops the robot: `failed` says why, and `finish` raises.
 """
 
 from collections.abc import Callable, Generator, Mapping
@@ -30,18 +29,18 @@ from pipeline.robot.run_recording import (
 )
 
 MOST_IMAGE_BYTES: Final = 2**27
-"""Waiting to be written, from which on images are dropped."""
+"""Images are dropped when more than this waits to be written."""
 MOST_BYTES: Final = 2**28
-"""Waiting to be written, from which on recording fails: without readings it would be no record."""
+"""Recording fails when more than this waits to be written, for readings cannot be dropped."""
 _FASTEST: Final = {"compression_level": "1", "pred": "up"}
 
 
 class RunRecorder:
-    """Records one run on a robot as `run_NNNNNN` in a folder, of any embodiment.
+    """Records one run on a robot, of any embodiment, as `run_NNNNNN` in a folder.
 
-    In each tick the loop calls `frames` and `answer` where there are new ones, then `tick`, also
-    for the tick that ends a run: what was observed may be why. None of them waits or raises. What
-    a kill leaves is `run_NNNNNN.part`, which `recover` finishes.
+    In each tick the loop calls `frames` and `answer` where there are new ones, then `tick`, also in
+    the tick that ends a run, whose readings may be the reason. None of them waits or raises. A kill
+    leaves `run_NNNNNN.part`, which `recover` finishes.
     """
 
     def __init__(
@@ -51,14 +50,14 @@ class RunRecorder:
         instruction: str,
         settings: Mapping[str, Any] | None = None,
     ) -> None:
-        """`metadata` is the policy's, `settings` those of the loop; both are kept, as JSON.
+        """`metadata` is the policy's, `settings` are the loop's; both are kept as JSON.
 
         Raises `RecordingError` where the folder cannot be made, `DiskFull` where the disk is full.
         """
         self._types = log_types(metadata)
         self._views = {view: i for i, view in enumerate(metadata["streams"]["views"])}
-        told = {"instruction": instruction, "metadata": metadata, "settings": settings or {}}
-        self.part = begin_part(Path(folder), told)
+        document = {"instruction": instruction, "metadata": metadata, "settings": settings or {}}
+        self.part = begin_part(Path(folder), document)
         self.dropped_images = 0
         self._error: Exception | None = None
         self._tick = np.zeros(1, self._types["tick"])
@@ -71,14 +70,14 @@ class RunRecorder:
 
     @property
     def failed(self) -> str | None:
-        """Why nothing is recorded any more; None while all is well."""
+        """Why nothing is recorded any more; None while recording works."""
         return None if self._error is None else f"{type(self._error).__name__}: {self._error}"
 
     def frames(self, frames: Mapping[str, tuple[float, NDArray[np.uint8]]]) -> None:
-        """Take what the model looks at: by view when it was captured (s), and RGB.
+        """Record frames for the model: by view when each was captured (s), and RGB.
 
-        A frame no newer than the last of its view is that frame. A camera that the policy does not
-        look at is passed over; an image that finds no room in the queue is dropped and counted.
+        A frame no newer than the last of its view is the same frame. Cameras that the policy does
+        not look at are ignored; an image that finds no room in the queue is dropped and counted.
         """
         with self._unharmed():
             for view, (time, image) in frames.items():
@@ -95,17 +94,17 @@ class RunRecorder:
                 self._frames += 1
 
     def answer(self, answer: Mapping[str, Any]) -> None:
-        """Take whose features the actions from here on follow: `feature_key`, `feature_age_s`."""
+        """Record the features behind the next actions: `feature_key`, `feature_age_s`."""
         with self._unharmed():
             self._tick["answer"] += 1
             self._tick["key"] = np.asarray(answer.get("feature_key", 0), np.uint8)
             self._tick["age_s"] = answer.get("feature_age_s", np.nan)
 
     def tick(self, observed: Mapping[str, Any], action: ArrayLike | None) -> None:
-        """Take a tick: the readings since the last, its `time`, and the action really sent.
+        """Record a tick: its `time`, the readings since the last, and the action that was sent.
 
-        None where none was: then the tick is no row, but its readings are kept. A recording is one
-        episode: it fails, with what came before, where `reset` says that another begins.
+        Without an action the tick is no row, but its readings are kept. A recording is one episode:
+        it fails, and keeps what came before, where `reset` begins another.
         """
         with self._unharmed():
             if observed.get("reset") and self._tick["time"] > -np.inf:
@@ -123,17 +122,17 @@ class RunRecorder:
             self._append("tick", self._tick.copy())
 
     def finish(self, reason: str, timings: Mapping[str, Any] | None = None) -> Path:
-        """Write what waits and make the recording; `run.json` says why the run ended.
+        """Finish the recording and return its folder, a LeRobot data set.
 
-        Returns its folder, a LeRobot data set. Raises `DiskFull` or `RecordingError` where it could
-        not be written, or nothing was observed; then the `.part` is kept.
+        `run.json` says why the run ended. Raises `DiskFull` or `RecordingError` where it could not
+        be written, or nothing was observed; then the `.part` is kept.
         """
         self._queue.put(None)
         self._thread.join()
         if self._error is not None:
             raise _unfinished(self.part, self._error) from self._error
-        told = {"reason": reason, "timings": timings or {}, "dropped_images": self.dropped_images}
-        return _finished(self.part, told)
+        end = {"reason": reason, "timings": timings or {}, "dropped_images": self.dropped_images}
+        return _finished(self.part, end)
 
     @property
     def _waiting_bytes(self) -> int:
@@ -141,7 +140,7 @@ class RunRecorder:
 
     @contextmanager
     def _unharmed(self) -> Generator[None]:
-        """Whatever fails here fails the recording, never the loop whose robot is moving."""
+        """Turn an error into one of the recording; the loop, whose robot moves, goes on."""
         try:
             yield
         except Exception as error:
@@ -161,7 +160,7 @@ class RunRecorder:
         self._queue.put((work, size))
 
     def _write(self) -> None:
-        """The thread: what is put is written in this order, until something cannot be."""
+        """The thread: write in the order of `_put`, until something cannot be written."""
         whole = True
         for work, size in iter(self._queue.get, None):
             if whole:
@@ -189,8 +188,8 @@ def recover(part: str | Path) -> Path:
 
 
 def encode_png(image: NDArray[np.uint8]) -> bytes:
-    """A PNG of the very pixels (height, width, 3), RGB."""
-    # Three times as quick as Pillow, and other threads run meanwhile.
+    """A lossless PNG of RGB pixels (height, width, 3)."""
+    # Three times as fast as Pillow, and other threads run meanwhile.
     context = av.CodecContext.create("png", "w")
     context.height, context.width = image.shape[:2]
     context.pix_fmt, context.framerate, context.options = "rgb24", Fraction(1), _FASTEST

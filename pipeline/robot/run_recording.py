@@ -1,15 +1,15 @@
-"""The logs of a run on a robot, and the LeRobot data set of one episode that becomes of them.
+"""From the logs of a run on a robot to a recording, a LeRobot data set of one episode.
 
 While a robot runs, its recorder appends to plain logs in `run_000003.part`, which a kill can only
-cut off: `<log>.bin`, rows of the types of `log_types`, and a PNG a frame. `finish_recording` makes
-`run_000003` of them, a LeRobot v3.0 data set with this project's sidecars:
+cut off: `<log>.bin` with rows of `log_types`, and a PNG a frame. `finish_recording` turns them into
+`run_000003`, a LeRobot v3.0 data set with this project's sidecars:
 
-    data, meta             a row a tick in which an action was sent, images without loss; a row
-                           every tick, without `action`, where none was sent in the whole run
-    state, sensor          every reading, at the rate that it came
+    data, meta             a row for each tick with an action, images without loss; a row for every
+                           tick, without `action`, where the whole run has none
+    state, sensor          every reading, at its own rate
     frames                 when each row's images were captured
-    features               which features each action was decided on: `row_key` and age
-    run.json               the policy's metadata, the settings, and how the run ended
+    features               the features behind each action: `row_key` and age
+    run.json               the policy's metadata, the settings, and why the run ended
 
 Times are seconds since the first row; `run.json` says when that was on the robot's clock.
 """
@@ -40,21 +40,21 @@ Log = NDArray[Any]
 
 
 class RunDocument(Document):
-    """What `run.json` says; what is not named here is kept, too."""
+    """The content of `run.json`; fields that are not named here are kept, too."""
 
     model_config = ConfigDict(extra="allow")
 
     metadata: dict[str, Any]
-    """The policy's."""
+    """Metadata of the policy."""
     instruction: Text = ""
 
 
 def log_types(metadata: Mapping[str, Any]) -> "dict[str, np.dtype[Any]]":
-    """The rows of each log of a policy with this metadata, by the log's name.
+    """The row type of each log by name, for a policy with this metadata.
 
-    `tick`: its `time` (s, the robot's clock), whether an action was sent (`acted`), how many state
-    readings had come (`states`), by view the number of the newest `frame` (-1: none), and of the
-    newest answer its number (`answer`, 0: none), `key` and `age_s`.
+    `tick` has its `time` (s, the robot's clock), whether an action was sent (`acted`), the state
+    readings so far (`states`), the number of the newest `frame` of each view (-1: none), and the
+    newest answer's number (`answer`, 0: none), `key` and `age_s`.
     """
     streams = metadata["streams"]
     widths = {name: len(streams.get(name, {}).get("names", ())) for name in READINGS}
@@ -72,14 +72,11 @@ def log_types(metadata: Mapping[str, Any]) -> "dict[str, np.dtype[Any]]":
 
 
 def begin_part(folder: Path, document: Mapping[str, Any]) -> Path:
-    """A new folder `run_NNNNNN.part` in `folder`, numbered after all runs there.
-
-    Raises `RecordingError` where it cannot be made.
-    """
+    """Make the next `run_NNNNNN.part` in `folder`; `RecordingError` where it cannot be made."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        found = (re.match(r"run_(\d+)", path.name) for path in folder.iterdir())
-        number = max((int(match[1]) for match in found if match), default=-1) + 1
+        runs = (re.match(r"run_(\d+)", path.name) for path in folder.iterdir())
+        number = max((int(match[1]) for match in runs if match), default=-1) + 1
         part = folder / f"run_{number:06d}.part"
         (part / "frames").mkdir(parents=True)
     except OSError as error:
@@ -91,16 +88,15 @@ def begin_part(folder: Path, document: Mapping[str, Any]) -> Path:
 
 
 def frame_path(part: Path, number: int) -> Path:
-    """Where a run's frame of this number lies while it runs."""
+    """The file of a frame while the run lasts."""
     return part / "frames" / f"{number:06d}.png"
 
 
 def finish_recording(part: Path, end: Mapping[str, Any]) -> Path:
-    """Make the recording of a run's logs, in place of them; returns where it is.
+    """Turn a run's logs into its recording and return the folder.
 
-    `end` is what `run.json` says of the end. Until all is written the logs are kept and nothing
-    looks like a recording. A run in which no action was sent has a row a tick and no `action`.
-    Raises `RecordingError` where there is no tick, and for any other folder.
+    `end` is added to `run.json`. Until all is written the logs stay, and nothing looks like a
+    recording. Raises `RecordingError` where there is no tick, and for any other folder.
     """
     if part.suffix != ".part":
         raise RecordingError(f"{part}: expected what is left of a run, run_NNNNNN.part")
@@ -130,17 +126,17 @@ def finish_recording(part: Path, end: Mapping[str, Any]) -> Path:
 
 
 def _read(part: Path, name: str, kind: "np.dtype[Any]") -> Log:
-    """A log's whole rows: one that a kill or a full disk cut off is left out."""
+    """The complete rows of a log, without one that a kill or a full disk cut off."""
     path = part / f"{name}.bin"
     rows = path.stat().st_size // kind.itemsize if path.exists() else 0
     return np.memmap(path, kind, "r", shape=(rows,)) if rows else np.zeros(0, kind)
 
 
 def _rows(logs: Mapping[str, Log]) -> Log:
-    """The ticks that become rows: an action was sent, and all their streams had begun.
+    """The ticks that become rows: those with an action once all streams have begun.
 
-    Where none was sent in the whole run, any tick may be a row. A tick at which the robot's clock
-    had not moved on is none: a recording's clock rises.
+    Without an action in the whole run every tick may be a row. A tick in which the robot's clock
+    stood still is none, because a recording's clock rises.
     """
     ticks = logs["tick"]
     if ticks["acted"].any():
@@ -154,7 +150,7 @@ def _rows(logs: Mapping[str, Log]) -> Log:
 def _write_readings(
     root: Path, run: RunDocument, logs: Mapping[str, Log], start_s: float
 ) -> dict[str, int]:
-    """The sidecars of readings; how many a reader would refuse: no numbers, or out of order."""
+    """Write the sidecars of readings; by stream how many are left out as NaN or out of order."""
     left_out: dict[str, int] = {}
     for name in READINGS:
         if len(log := logs[name]):
@@ -166,9 +162,9 @@ def _write_readings(
             left_out[name] = len(bad)
             kept = np.delete(log, bad) if len(bad) else log
             channels = run.metadata["streams"][name]
-            told = {key: np.array(channels[key], str) for key in ("names", "units")}
+            named = {key: np.array(channels[key], str) for key in ("names", "units")}
             readings = {"timestamps": kept["time"] - start_s, "values": kept["values"]}
-            write_sidecar(root, name, readings | told)
+            write_sidecar(root, name, readings | named)
     return left_out
 
 
@@ -190,7 +186,7 @@ def _write_rows(
     captured: dict[str, NDArray[np.float64]] = {}
     for view, number in views.items():
         key = f"observation.images.{view}"
-        images[key] = [frame_path(part, each) for each in number.tolist()]
+        images[key] = [frame_path(part, index) for index in number.tolist()]
         features[key] = {"shape": shown["shape"][number[0]].tolist()}
         # A camera may take a frame between the beginning of a tick and the question for it.
         came = rows["time"][np.searchsorted(number, number)]
@@ -198,6 +194,6 @@ def _write_rows(
     if captured:
         write_sidecar(root, "frames", captured)
     digest = np.array([str(metadata.get("feature_spec_digest", ""))])
-    told = {name: rows[name] for name in ("answer", "key", "age_s")}
-    write_sidecar(root, "features", told | {"feature_spec_digest": digest})
+    used = {name: rows[name] for name in ("answer", "key", "age_s")}
+    write_sidecar(root, "features", used | {"feature_spec_digest": digest})
     write_v30(root, columns, images, features, run.instruction, metadata["action_hz"])

@@ -1,14 +1,16 @@
-"""The policy server: openpi's protocol over a websocket, and a page that shows how it goes.
+"""The policy server: openpi's protocol over a websocket; beside it `/healthz`, `/status.json`.
 
-A connection is one robot: it gets the metadata, then an answer to each observation, in order. What
-is wrong with a message costs its connection only. One line of text says what went wrong, before the
-connection is closed: `refused: …`, `error: …`; after `busy: …` it stays open.
+A connection is one robot: it gets the metadata, then an answer to each observation, in order. A
+wrong message costs its own connection only: one line of text says why, `refused: …` or `error: …`,
+and the connection is closed. After `busy: …` it stays open.
 """
 
 import asyncio
 import hmac
 import ipaddress
+import json
 import logging
+import math
 import os
 import signal
 import socket
@@ -20,7 +22,8 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, suppress
 from functools import partial
 from http import HTTPStatus
-from typing import Final
+from time import monotonic
+from typing import Any, Final
 from urllib.parse import urlsplit
 
 from websockets.asyncio.server import Server, ServerConnection, serve
@@ -33,18 +36,20 @@ from pipeline.base.config import ServeParams
 from pipeline.base.errors import ConfigError, ObservationError, PipelineError, WireError
 from pipeline.robot import wire
 from pipeline.robot.client import TOKEN_VARIABLE
+from pipeline.robot.run_report import Timings
 from pipeline.robot.session import ServedPolicy, Session
-from pipeline.robot.status import ConnectedRobot, ServerStatus, page
 
 CLOSING_S: Final = 30.0
-"""How long an observation under way may keep the server from closing."""
-_SHARED: Final = {"Cache-Control": "no-store", "X-Content-Type-Options": "nosniff"}
+"""How long an unanswered observation may keep the server from closing."""
+_TIMED: Final = ("vlm_ms", "head_ms", "wait_ms", "infer_ms")
+_KEPT: Final = 5000
+"""Newest answers whose latencies are kept."""
 
 
 def read_token(params: ServeParams) -> str | None:
-    """The token of `serve.token_file`, else of the environment, else none.
+    """The token of `serve.token_file`, else of the environment, else None.
 
-    Raises `ConfigError` for an empty one, and where the host asks for one and there is none.
+    Raises `ConfigError` for an empty token, and for a host that needs one without one.
     """
     token, file = os.environ.get(TOKEN_VARIABLE), params.token_file
     try:
@@ -71,7 +76,7 @@ def read_token(params: ServeParams) -> str | None:
 def listen(params: ServeParams) -> socket.socket:
     """A socket at `serve.host` and `serve.port`, not yet listening.
 
-    Raises `ConfigError` where the address is not this machine's, or is taken.
+    Raises `ConfigError` where the address is not of this machine, or is taken.
     """
     with ExitStack() as undo:
         try:
@@ -89,6 +94,32 @@ def listen(params: ServeParams) -> socket.socket:
         return bound
 
 
+class ServerStatus:
+    """Counts and latencies of a server's answers, and what it serves."""
+
+    def __init__(self, metadata: Mapping[str, Any]) -> None:
+        self.refused = self.busy = 0
+        shown = ("checkpoint", "step", "model_type", "action_hz", "feature_spec_digest")
+        self._policy = {name: metadata[name] for name in shown}
+        self._timings, self._since_s = Timings(_TIMED, _KEPT), monotonic()
+        self._lock = threading.Lock()
+
+    def answered(self, timing: Mapping[str, float]) -> None:
+        """Note the `server_timing` of an answer, from any thread; a part of 0 ms did not happen."""
+        with self._lock:
+            self._timings.note([timing[part] or math.nan for part in _TIMED])
+
+    def json(self, connected: int) -> str:
+        """The content of `/status.json`, with the number of robots that are connected."""
+        with self._lock:
+            answered, latency = self._timings.count, self._timings.document()
+        counts = {"connected": connected, "answered": answered}
+        counts |= {"refused": self.refused, "busy": self.busy}
+        seconds = monotonic() - self._since_s
+        document = {"policy": self._policy, "seconds": seconds, "counts": counts}
+        return json.dumps(document | {"latency": latency})
+
+
 class PolicyServer:
     """Serves a policy until `stop`, Ctrl-C or SIGTERM."""
 
@@ -100,13 +131,13 @@ class PolicyServer:
         bound: socket.socket,
         say: Callable[[str], None] = lambda line: None,
     ) -> None:
-        """`bound` is what `listen` gave, `token` what `read_token` did."""
+        """`bound` comes from `listen`, `token` from `read_token`."""
         self._served, self._params, self._token, self._say = served, params, token, say
         self._socket = bound
         host, port = bound.getsockname()[:2]
         self.address = f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
         self.status = ServerStatus(served.metadata)
-        # A thread a robot, for each has at most one observation under way.
+        # One thread a robot, which has at most one unanswered observation.
         self._threads = ThreadPoolExecutor(params.max_connections, "robot")
         self._answering = 0
         self._idle: set[ServerConnection] = set()
@@ -114,15 +145,15 @@ class PolicyServer:
         self._stop: Callable[[], object] = lambda: None
 
     def run(self, started: Callable[[], None] = lambda: None) -> bool:
-        """Serve; whether a signal ended it. `started` is called once connections are taken."""
+        """Serve, and call `started` once robots can connect; whether a signal ended it."""
         try:
             return asyncio.run(self._run(started))
         finally:
             self._threads.shutdown()
 
     def stop(self) -> None:
-        """Have `run` end, from any thread, once it has begun: what is under way is answered."""
-        with suppress(RuntimeError):  # it has ended
+        """End `run` from any thread, once it has begun; observations that came are answered."""
+        with suppress(RuntimeError):  # it has ended already
             self._stop()
 
     async def _run(self, started: Callable[[], None]) -> bool:
@@ -131,7 +162,7 @@ class PolicyServer:
         if threading.current_thread() is threading.main_thread():
             for number in (signal.SIGINT, signal.SIGTERM):
                 loop.add_signal_handler(number, signalled.put_nowait, True)
-        # Handshakes of strangers that fail are no news.
+        # Failed handshakes of strangers are not logged.
         quiet = logging.getLogger(f"{__name__}.websockets")
         quiet.setLevel(logging.CRITICAL + 1)
         server = await serve(
@@ -151,7 +182,7 @@ class PolicyServer:
         return by_signal
 
     async def _close(self, server: Server) -> None:
-        """No new connections, an answer to each observation under way, then 1001."""
+        """Refuse new connections, answer the observations that came, then close with 1001."""
         self._stopping = True
         server.close(close_connections=False)
         await asyncio.gather(*(_leave(connection) for connection in self._idle))
@@ -163,16 +194,15 @@ class PolicyServer:
 
     async def _converse(self, connection: ServerConnection) -> None:
         """One robot, from its metadata to its last answer."""
-        peer = str(connection.remote_address[0])
-        with self.status.connected(peer) as robot, suppress(ConnectionClosed, TimeoutError):
+        with suppress(ConnectionClosed, TimeoutError):
             await connection.send(wire.pack(self._served.metadata))
             session = self._served.session(self._params.fresh, self._params.seed)
             code = None
             while code is None and not self._stopping:
                 message = await self._next(connection)
-                said, code = await self._answer(robot, message, session)
+                answer, code = await self._answer(message, session)
                 del message
-                await connection.send(said)
+                await connection.send(answer)
             if code is None:
                 await _leave(connection)
             else:
@@ -180,7 +210,7 @@ class PolicyServer:
                 await connection.close(code)
 
     async def _next(self, connection: ServerConnection) -> str | bytes:
-        """The next message; closes a connection from which none comes."""
+        """The next message; closes a connection that sends none."""
         self._idle.add(connection)
         try:
             async with asyncio.timeout(self._params.idle_s):
@@ -193,17 +223,17 @@ class PolicyServer:
             self._idle.discard(connection)
 
     async def _answer(
-        self, robot: ConnectedRobot, message: str | bytes, session: Session
+        self, message: str | bytes, session: Session
     ) -> tuple[str | bytes, int | None]:
-        """What is said to a message, and the code to close the connection with, None to go on."""
+        """The answer to a message, and the code to close the connection with; None to go on."""
         if isinstance(message, str):
-            said = "refused: expected a message of bytes (msgpack), found a text"
-            return said, CloseCode.UNSUPPORTED_DATA
+            why = "refused: expected a message of bytes (msgpack), found a text"
+            return why, CloseCode.UNSUPPORTED_DATA
         loop, busy = asyncio.get_running_loop(), self._answering >= self._params.max_waiting
-        asked = (robot, message, session, busy)
         self._answering += 1
         try:
-            return await loop.run_in_executor(self._threads, self._think, *asked), None
+            work = (self._think, message, session, busy)
+            return await loop.run_in_executor(self._threads, *work), None
         except WireError as error:
             return f"refused: {_line(error)}", CloseCode.INVALID_DATA
         except ObservationError as error:
@@ -212,14 +242,12 @@ class PolicyServer:
             return f"error: {_line(error)}", CloseCode.INTERNAL_ERROR
         except Exception as error:
             traceback.print_exception(error, file=sys.stderr)
-            said = f"error: {type(error).__name__}: the server's output says more"
-            return said, CloseCode.INTERNAL_ERROR
+            why = f"error: {type(error).__name__}: the server's output says more"
+            return why, CloseCode.INTERNAL_ERROR
         finally:
             self._answering -= 1
 
-    def _think(
-        self, robot: ConnectedRobot, message: bytes, session: Session, busy: bool
-    ) -> str | bytes:
+    def _think(self, message: bytes, session: Session, busy: bool) -> str | bytes:
         """The answer to a message, in a thread of its own."""
         observation = session.take(wire.unpack(message, self._params.max_message_mb * 2**20))
         if busy:
@@ -227,14 +255,14 @@ class PolicyServer:
             waiting = self._params.max_waiting
             return f"busy: {waiting} observations are waiting; the readings were taken"
         answer = session.answer(observation)
-        self.status.answered(robot, observation, answer)
+        self.status.answered(answer["server_timing"])
         if "feature_key" in answer:
             # Bytes, not an array: openpi's chunk broker takes every array for one of steps.
             answer["feature_key"] = answer["feature_key"].tobytes()
         return wire.pack(answer)
 
     async def _respond(self, connection: ServerConnection, request: Request) -> Response | None:
-        """The answer to a request by HTTP; None where it opens a websocket."""
+        """The answer to an HTTP request; None where it opens a websocket."""
         headers, say = request.headers, partial(_response, connection)
         try:
             path, foreign = urlsplit(request.path).path, self._is_foreign(headers)
@@ -243,38 +271,35 @@ class PolicyServer:
         except MultipleValuesError as error:
             return say(HTTPStatus.BAD_REQUEST, f"expected the header {error} once, found several\n")
         except ValueError as error:
-            said = f"expected addresses in the path, Host and Origin, found one without: {error}\n"
-            return say(HTTPStatus.BAD_REQUEST, said)
+            why = f"expected addresses in the path and Host, found another: {error}\n"
+            return say(HTTPStatus.BAD_REQUEST, why)
         if path == "/healthz":
             return say(HTTPStatus.OK, "OK\n")
         if foreign:
-            return say(HTTPStatus.FORBIDDEN, "pages of other places are not served\n")
-        if path == "/" and not opens:
-            return say(HTTPStatus.OK, *page())
+            return say(HTTPStatus.FORBIDDEN, "web pages are not served\n")
         if not authorized:
-            said = "expected the header Authorization: Api-Key <the server's token>\n"
-            return say(HTTPStatus.UNAUTHORIZED, said, {"WWW-Authenticate": "Api-Key"})
+            why = "expected the header Authorization: Api-Key <the server's token>\n"
+            return say(HTTPStatus.UNAUTHORIZED, why, **{"WWW-Authenticate": "Api-Key"})
+        connected, most = len(connection.server.connections), self._params.max_connections
         if path == "/status.json":
-            text = await asyncio.to_thread(self.status.json)
-            return say(HTTPStatus.OK, text, {"Content-Type": "application/json"})
+            kind = {"Content-Type": "application/json"}
+            return say(HTTPStatus.OK, self.status.json(connected), **kind)
         if not opens:
-            return say(HTTPStatus.NOT_FOUND, "not here: /, /healthz, /status.json\n")
-        most = self._params.max_connections
-        if len(self.status.robots) < most:
+            why = "expected a websocket at /, /healthz or /status.json\n"
+            return say(HTTPStatus.NOT_FOUND, why)
+        if connected < most:
             return None
-        said = f"busy: {most} robots are connected (serve.max_connections)\n"
-        return say(HTTPStatus.SERVICE_UNAVAILABLE, said)
+        why = f"busy: {most} robots are connected (serve.max_connections)\n"
+        return say(HTTPStatus.SERVICE_UNAVAILABLE, why)
 
     def _is_foreign(self, headers: Headers) -> bool:
-        """Whether a page of another place asks, which a browser on this machine would let in.
+        """Whether a web page asks, through a browser on this machine.
 
-        Without a token that is also told by the name that the browser believes to talk to: another
-        place's name can be made to mean this machine.
+        Browsers send `Origin` with it; or, without a token, a `Host` whose name was made to mean
+        this machine.
         """
-        here = urlsplit(f"//{headers.get('Host', '')}")
-        if "Origin" in headers and urlsplit(headers["Origin"]).netloc != here.netloc:
-            return True
-        return self._token is None and not _is_loopback(here.hostname or "")
+        host = urlsplit(f"//{headers.get('Host', '')}").hostname
+        return "Origin" in headers or (self._token is None and not _is_loopback(host or ""))
 
     def _authorized(self, headers: Headers) -> bool:
         given = headers.get("Authorization", "").encode()
@@ -282,13 +307,11 @@ class PolicyServer:
 
 
 def _response(
-    connection: ServerConnection,
-    status: HTTPStatus,
-    text: str,
-    headers: Mapping[str, str] = _SHARED,
+    connection: ServerConnection, status: HTTPStatus, text: str, **headers: str
 ) -> Response:
     response = connection.respond(status, text)
-    for name, value in {**_SHARED, **headers}.items():
+    headers |= {"Cache-Control": "no-store", "X-Content-Type-Options": "nosniff"}
+    for name, value in headers.items():
         response.headers.pop(name, None)
         response.headers[name] = value
     return response
@@ -306,5 +329,5 @@ def _is_loopback(host: str) -> bool:
 
 
 def _line(error: Exception) -> str:
-    """What an error says, in one line that may be long."""
+    """The message of an error in one line."""
     return " ".join(str(error).split())[:2000]

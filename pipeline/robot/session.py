@@ -2,7 +2,7 @@
 
 import threading
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from time import perf_counter
@@ -16,33 +16,29 @@ from pipeline.base.config import VLMParams
 from pipeline.base.device import resolve_device
 from pipeline.base.errors import CheckpointMismatch, NumericsError, ObservationError
 from pipeline.policy.checkpoint import PolicyCheckpoint, find_policy, load_policy
+from pipeline.policy.guidance import Guide
 from pipeline.policy.observation import moving_channels
 from pipeline.policy.policy import Policy
 from pipeline.robot.chunking import PlanGuide
-from pipeline.robot.features import LiveFeatures
 from pipeline.robot.first_look import FirstLook
-from pipeline.robot.guides import stack_guides
-from pipeline.robot.memory import RobotMemory, SeenFeatures
+from pipeline.robot.live_features import LiveFeatures, prove
 from pipeline.robot.observation import ObservationReader, RobotObservation
-from pipeline.robot.proof import prove
+from pipeline.robot.robot_memory import RobotMemory, SeenFeatures
 
 PROTOCOL = 1
-"""Of observations, answers and metadata."""
+"""Version of observations, answers and metadata."""
 
 Answer = dict[str, Any]
-
-
-Slot = deque[tuple[RobotObservation, str]]
-"""The newest observation whose frames the model is to look at, if any, and what it is told."""
-Seen = tuple[SeenFeatures, bytes, float]
-"""What a pass of the model gave, the key of it, and the seconds that it took."""
+WaitingFrames = deque[tuple[RobotObservation, str]]
+"""At most one entry: the newest observation with frames for the model, and its instruction."""
+Pass = tuple[SeenFeatures, float]
+"""The features of one pass of the model, and the seconds that the pass took."""
 
 
 class ServedPolicy:
     """A policy and its live model, shared by sessions.
 
-    Passes of the model are made one at a time, in the order in which they were asked for, and so
-    are those of the head.
+    The model runs one pass at a time, in the order of the requests, and so does the head.
     """
 
     def __init__(
@@ -54,7 +50,7 @@ class ServedPolicy:
         look: FirstLook | None = None,
         say: Callable[[str], None] = print,
     ) -> None:
-        """`features` is the model where the policy looks at features, and has been proved."""
+        """`features` is the proved model, None where the policy looks at no features."""
         self.checkpoint, self.policy, self.look = checkpoint, policy, look
         self._features, self._say, self._name = features, say, name
         self._passes = ThreadPoolExecutor(1, "vlm")
@@ -66,7 +62,7 @@ class ServedPolicy:
     def load(
         cls, folder: Path, vlm: VLMParams, device: str, say: Callable[[str], None]
     ) -> "ServedPolicy":
-        """The checkpoint that `folder` means, once the model of `vlm` is proved to be its own.
+        """The policy of `folder`, once the model of `vlm` is proved to give its features.
 
         Raises `CheckpointMismatch` where the model gives other features, `CheckpointIncomplete` as
         `find_policy`, and `VLMError` as `LiveVLM.load`.
@@ -87,25 +83,25 @@ class ServedPolicy:
         return cls(checkpoint, policy, features, str(folder), FirstLook(checkpoint), say)
 
     def session(self, fresh: bool = True, seed: int = 0) -> "Session":
-        """The memory of one robot; `seed` is of what the policy draws for it.
+        """A session of one robot; `seed` seeds the samples that the policy draws for it.
 
-        `fresh`: a chunk waits for the features of the frames that came with its observation. Else
-        it takes the newest there are, and only the first of an episode are waited for.
+        With `fresh` a chunk waits for the features of the frames of its own observation. Without,
+        it takes the newest features, and waits only for the first of an episode.
         """
         return Session(self, fresh, seed)
 
     def close(self) -> None:
-        """Begin no more passes, and wait for the one under way."""
+        """Begin no more passes, and wait for the one that runs."""
         self._passes.shutdown(cancel_futures=True)
 
-    def begin_pass(self, slot: Slot) -> Future[Seen]:
-        """Have the model look at the frames that are in `slot` when its turn comes."""
-        return self._passes.submit(self._pass, slot)
+    def begin_pass(self, waiting: WaitingFrames) -> Future[Pass]:
+        """Queue a pass of the model on the frames that `waiting` holds when its turn comes."""
+        return self._passes.submit(self._pass, waiting)
 
     def chunk(
         self, fields: Mapping[str, NDArray[Any]], drawn: torch.Generator, guide: PlanGuide | None
     ) -> tuple[NDArray[np.float32], float]:
-        """The head's chunk (horizon, action) for the fields of one robot, and the seconds it took.
+        """The head's chunk (horizon, action) for one robot, and the seconds that it took.
 
         Raises `NumericsError` where it is not finite.
         """
@@ -119,10 +115,10 @@ class ServedPolicy:
         return chunk, perf_counter() - began
 
     def instruction(self, prompt: str | None) -> str:
-        """What the model is told: the prompt, else the only words the policy was trained on.
+        """The prompt, or without one the only instruction that the policy was trained on.
 
-        Raises `ObservationError` where there is no telling; words that training never saw are
-        said once.
+        Warns once of an instruction that training never saw. Raises `ObservationError` without a
+        prompt where training saw none or several.
         """
         trained = self.checkpoint.instructions
         known = ", ".join(map(repr, trained))
@@ -136,13 +132,13 @@ class ServedPolicy:
             self._say(f"warning: the policy was never trained on {prompt!r:.200}, but on {known}")
         return prompt
 
-    def _pass(self, slot: Slot) -> Seen:
+    def _pass(self, waiting: WaitingFrames) -> Pass:
         assert self._features is not None
-        (observation, instruction), began = slot.pop(), perf_counter()
+        (observation, instruction), began = waiting.pop(), perf_counter()
         features, valid = self._features([observation.frames], instruction)
-        seen = SeenFeatures(features[0].numpy(), valid[0].numpy(), observation.frame_time_s)
         key = self._features.key(observation.frames, instruction)
-        return seen, key, perf_counter() - began
+        seen = SeenFeatures(features[0].numpy(), valid[0].numpy(), observation.frame_time_s, key)
+        return seen, perf_counter() - began
 
     def _metadata(self) -> dict[str, Any]:
         source, params = self.checkpoint.source, self.policy.params
@@ -169,9 +165,9 @@ class ServedPolicy:
 
 
 class Session:
-    """What a served policy remembers of one robot: observation in, answer out.
+    """A served policy with the memory of one robot: observation in, answer out.
 
-    Not to be called by two threads at once; sessions of one policy may be.
+    One thread at a time may call a session; sessions of one policy may run at once.
     """
 
     def __init__(self, served: ServedPolicy, fresh: bool, seed: int) -> None:
@@ -180,15 +176,15 @@ class Session:
         self._drawn = torch.Generator().manual_seed(seed)
         self._reader = ObservationReader(served.metadata)
         source = served.checkpoint.source
-        # Half a tick less, for clocks are not exact.
+        # Half a tick less, because clocks are not exact.
         self._between_s = (source["vlm_reuse_count"] - 0.5) / source["action_hz"]
         self._begin_episode()
 
     def infer(self, observation: Mapping[str, Any]) -> Answer:
         """The answer to an observation: `actions` (horizon, action) in the units of the metadata.
 
-        Beside it `server_timing` in ms, and where the policy looks at features `feature_age_s` and
-        `feature_key` (16,). Raises `ObservationError`, `NumericsError` and `VLMError`.
+        It also has `server_timing` in ms and, where the policy looks at features, `feature_age_s`
+        and `feature_key` (16,). Raises `ObservationError`, `NumericsError` and `VLMError`.
         """
         return self.answer(self.take(observation))
 
@@ -204,7 +200,7 @@ class Session:
         return observation
 
     def answer(self, observation: RobotObservation) -> Answer:
-        """The answer to what `take` took."""
+        """The answer to the observation that `take` returned."""
         self._look_first(observation)
         vlm_s = self._look(observation) if self.metadata["uses_features"] else 0.0
         fields = self._memory.observation()
@@ -214,22 +210,21 @@ class Session:
         spent = {"infer_ms": whole_s, "vlm_ms": vlm_s, "head_ms": head_s, "wait_ms": wait_s}
         timing = {part: 1000 * seconds for part, seconds in spent.items()}
         answer: Answer = {"actions": actions, "server_timing": timing}
-        if self._key is not None:
-            key = np.frombuffer(self._key, np.uint8)
+        if (seen := self._memory.features) is not None:
+            key = np.frombuffer(seen.key, np.uint8)
             answer |= {"feature_age_s": float(fields["feature_age"]), "feature_key": key}
         return answer
 
     def _begin_episode(self) -> None:
         self._memory = RobotMemory.of(self._served.policy)
-        # A pass of the episode before keeps a slot of its own, and is never asked for its answer.
-        self._slot: Slot = deque(maxlen=1)
-        self._under_way: Future[Seen] | None = None
+        # A pass of the episode before has its own deque, and nobody takes its result.
+        self._waiting: WaitingFrames = deque(maxlen=1)
+        self._running: Future[Pass] | None = None
         self._began_s, self._instruction = -np.inf, ""
-        self._key: bytes | None = None
         self._frames_known = self._state_known = False
 
     def _look_first(self, observation: RobotObservation) -> None:
-        """Refuse another robot than the policy's by its first frames and states of an episode."""
+        """Refuse another robot than the policy's by the first frames and states of an episode."""
         frames = {} if self._frames_known else observation.frames
         state = None if self._state_known else observation.readings.get("state")
         if self._served.look is not None and (frames or state is not None):
@@ -238,22 +233,25 @@ class Session:
         self._state_known |= state is not None
 
     def _look(self, observation: RobotObservation) -> float:
-        """See to the newest features; the seconds of the pass that ended for this answer."""
-        told = observation.prompt not in (None, self._instruction)
-        if told and not observation.frames and self._memory.features is not None:
+        """Bring the features up to date; the seconds of a pass that ended for this answer, else 0.
+
+        A pass begins at another prompt, and `vlm_reuse_count` ticks after the one before.
+        """
+        new_prompt = observation.prompt not in (None, self._instruction)
+        if new_prompt and not observation.frames and self._memory.features is not None:
             raise ObservationError(
                 f"prompt: expected frames beside another prompt than {self._instruction!r:.200}, "
                 "for features are of both, found none"
             )
-        spent = self._collect(wait=told)
-        waited = observation.time_s - self._began_s >= self._between_s
-        if observation.frames and (waited or told):
+        spent = self._collect(wait=new_prompt)
+        due = new_prompt or observation.time_s - self._began_s >= self._between_s
+        if observation.frames and due:
             instruction = self._served.instruction(observation.prompt)
-            self._slot.append((observation, instruction))
+            self._waiting.append((observation, instruction))
             self._began_s, self._instruction = observation.time_s, instruction
-        if self._slot and self._under_way is None:
-            self._under_way = self._served.begin_pass(self._slot)
-        spent = self._collect(self._fresh or told or self._memory.features is None) or spent
+        if self._waiting and self._running is None:
+            self._running = self._served.begin_pass(self._waiting)
+        spent = self._collect(self._fresh or new_prompt or self._memory.features is None) or spent
         if self._memory.features is None:
             views = ", ".join(f"images/{view}" for view in self.metadata["streams"]["views"])
             raise ObservationError(
@@ -263,8 +261,22 @@ class Session:
 
     def _collect(self, wait: bool) -> float:
         """Take the features of a pass that has ended; the seconds it took, 0 without one."""
-        if self._under_way is None or not (wait or self._under_way.done()):
+        if self._running is None or not (wait or self._running.done()):
             return 0.0
-        ended, self._under_way = self._under_way, None
-        self._memory.features, self._key, spent = ended.result()
+        ended, self._running = self._running, None
+        self._memory.features, spent = ended.result()
         return spent
+
+
+def stack_guides(guides: Sequence[PlanGuide | None], device: torch.device) -> Guide | None:
+    """The guides of a batch of robots, in this order, on `device`; None where no robot has one.
+
+    A robot without a plan gets weight 0, so that its chunk is drawn freely.
+    """
+    given = next((guide for guide in guides if guide is not None), None)
+    if given is None:
+        return None
+    free = PlanGuide(np.zeros_like(given.chunk), np.zeros_like(given.weight))
+    rows = [guide or free for guide in guides]
+    chunk, weight = np.stack([row.chunk for row in rows]), np.stack([row.weight for row in rows])
+    return Guide(torch.from_numpy(chunk).to(device), torch.from_numpy(weight).to(device))

@@ -1,7 +1,7 @@
 """Messages between robot and server: msgpack with numpy arrays, as openpi-client writes them.
 
-Nothing of a message is ever run or unpickled, and all of it is bounded: whatever is wrong with one
-is a `WireError`. Needs numpy and msgpack alone.
+Nothing in a message is ever executed or unpickled, and its size, depth and entries are bounded. A
+wrong message is a `WireError`. Needs only numpy and msgpack.
 """
 
 import math
@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 from pipeline.base.errors import WireError
 
 MAX_BYTES: Final = 64 * 2**20
-"""Of a message, unless a caller says otherwise."""
+"""Default bound of a message."""
 MAX_DEPTH: Final = 12
 MAX_ENTRIES: Final = 20_000
-"""Of all lists and maps of a message together."""
+"""Entries of all lists and maps of a message together."""
 MAX_TEXT: Final = 1_000_000
 MAX_RANK: Final = 8
 
@@ -30,7 +30,7 @@ _DTYPE = re.compile(r"[<>|](b1|[iu][1248]|f[248])")
 def pack(message: Any) -> bytes:
     """The bytes of a message of maps, lists, texts, numbers and numpy arrays.
 
-    Raises `WireError` for what is none of them, and for arrays of other than plain numbers.
+    Raises `WireError` for anything else, and for arrays of other than plain numbers.
     """
     try:
         packed = msgpack.packb(message, default=_described)
@@ -41,10 +41,10 @@ def pack(message: Any) -> bytes:
 
 
 def unpack(data: bytes, max_bytes: int = MAX_BYTES) -> Any:
-    """The message of these bytes; its arrays are copies in the byte order of this machine.
+    """The message in these bytes; its arrays are copies in the byte order of this machine.
 
-    Raises `WireError` for what is no such message, for one that goes beyond the bounds of this
-    module, and for arrays of other than plain numbers or of another size than they say.
+    Raises `WireError` for bytes that are no message, for a message beyond the bounds of this
+    module, and for arrays of other than plain numbers or of a wrong size.
     """
     if len(data) > max_bytes:
         raise WireError(f"expected a message of at most {max_bytes} bytes, found {len(data)}")
@@ -63,27 +63,27 @@ def unpack(data: bytes, max_bytes: int = MAX_BYTES) -> Any:
     except WireError:
         raise
     except (ValueError, TypeError, OverflowError, RecursionError, msgpack.UnpackException) as error:
-        said = str(error) or type(error).__name__
-        raise WireError(f"expected a message in msgpack, found none: {said:.200}") from None
+        why = str(error) or type(error).__name__
+        raise WireError(f"expected a message in msgpack, found none: {why:.200}") from None
     _check_depth(message, MAX_DEPTH)
     return message
 
 
 class _Reader:
-    """Reads the maps and lists of one message, innermost first, and counts what they hold."""
+    """Reads the maps and lists of one message, innermost first, and counts their entries."""
 
     def __init__(self) -> None:
         self._entries = 0
 
     def counted(self, value: Any) -> Any:
-        """The list or map."""
+        """The same list or map, counted."""
         self._entries += 1 + len(value)
         if self._entries > MAX_ENTRIES:
             raise WireError(f"expected a message of at most {MAX_ENTRIES} entries, found more")
         return value
 
     def mapping(self, value: dict[Any, Any]) -> Any:
-        """The array or number that a map describes, else the map."""
+        """The array or number that a map describes, else the map itself."""
         self.counted(value)
         if b"__ndarray__" in value:
             return _array(value)
@@ -91,7 +91,7 @@ class _Reader:
 
 
 def _described(value: Any) -> Any:
-    """What msgpack writes for a numpy array or number."""
+    """The map that describes a numpy array or number."""
     if not isinstance(value, np.ndarray | np.generic):
         raise TypeError(f"expected maps, lists, texts, numbers or arrays, found {type(value)}")
     if not _DTYPE.fullmatch(value.dtype.str):
@@ -106,9 +106,9 @@ def _described(value: Any) -> Any:
     }
 
 
-def _array(said: Mapping[Any, Any]) -> NDArray[Any]:
-    dtype, data = _dtype(said), said.get(b"data")
-    shape: Any = said.get(b"shape")
+def _array(description: Mapping[Any, Any]) -> NDArray[Any]:
+    dtype, data = _dtype(description), description.get(b"data")
+    shape: Any = description.get(b"shape")
     sizes = isinstance(shape, list) and all(type(n) is int and n >= 0 for n in shape)
     if not sizes or len(shape) > MAX_RANK:
         raise WireError(f"expected the shape of an array, found {shape!r:.80}")
@@ -120,16 +120,16 @@ def _array(said: Mapping[Any, Any]) -> NDArray[Any]:
     return plain.astype(dtype.newbyteorder("="))
 
 
-def _number(said: Mapping[Any, Any]) -> Any:
-    value, dtype = said.get(b"data"), _dtype(said)
+def _number(description: Mapping[Any, Any]) -> Any:
+    value, dtype = description.get(b"data"), _dtype(description)
     if not isinstance(value, bool | int | float):
         raise WireError(f"expected a number, found {type(value).__name__}")
     with np.errstate(over="ignore"):
         return dtype.type(value)
 
 
-def _dtype(said: Mapping[Any, Any]) -> np.dtype[Any]:
-    name = said.get(b"dtype")
+def _dtype(description: Mapping[Any, Any]) -> np.dtype[Any]:
+    name = description.get(b"dtype")
     if not isinstance(name, str) or not _DTYPE.fullmatch(name):
         raise WireError(f"expected the dtype of plain numbers such as '<f4', found {name!r:.80}")
     return np.dtype(name)

@@ -6,7 +6,7 @@ import numpy as np
 
 from benchmarks.jitter_picture import jitter, worst
 from pipeline.look.page.style import write
-from pipeline.robot.timings import Timings
+from pipeline.robot.run_report import Timings
 
 
 def run(rows: int, seed: int) -> tuple[float, Timings]:

@@ -1,453 +1,605 @@
-"""Items are what the timeline and the store say, whichever door they come through."""
+"""One model, live or cached: the same answer, the arguments it has always had, and it learns."""
 
+import copy
 import json
 import pickle
-from collections.abc import Callable
-from dataclasses import replace
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from torch.utils.data import ConcatDataset, DataLoader
+from numpy.typing import NDArray
+from PIL import Image
+from pydantic import ValidationError
+from torch import Tensor
 
-from pipeline.base.config import Source, SplitParams, TrainHeadParams
-from pipeline.base.errors import ConfigError, RecordingError, StoreIncomplete, StoreMismatch
-from pipeline.base.observation import Observation
-from pipeline.compat.unified import no_normalization
-from pipeline.data import Channels, RecordedAction, open_recordings
-from pipeline.data.timeline import build_timeline
-from pipeline.data.windowed import WindowedRecording
-from pipeline.datasets import (
-    AsyncInsertionMeca500DatasetWithSensor,
-    NewAsyncInsertionDataset,
-    UnifiedVLADataset,
-    async_collate_fn_with_sensor,
-    unified_collate_fn,
+from pipeline.base.config import TrainHeadParams, TuningParams, VLMParams
+from pipeline.base.digests import file_digest
+from pipeline.base.errors import CheckpointMismatch, ObservationError, VLMError
+from pipeline.compat.unified import (
+    Not_freeze_QwenVLAWithSensor,
+    QwenVLAUnified,
+    QwenVLAWithSensor,
+    QwenVLAWithSensorDiffusion,
+    no_normalization,
 )
-from pipeline.models import QwenVLAUnified
-from pipeline.policy.observation import PolicyShape
-from pipeline.policy.policy import Policy
-from pipeline.store import Batch, FeatureStore
-from pipeline.train.split import split_by_episode
+from pipeline.policy.checkpoint import PolicyCheckpoint
+from pipeline.policy.guidance import Guide
+from pipeline.policy.observation import LiveObservation, PolicyShape
+from pipeline.policy.policy import Policy, Trainable
+from pipeline.vlm.feature_spec import feature_spec
+from pipeline.vlm.live import LiveVLM, live_spec
+from pipeline.vlm.preparation import Preparer
+from pipeline.vlm.qwen import FrozenVLM
 
-SMALL = TrainHeadParams.model_validate(
-    {
-        "sensor_encoder": {"channels": [16, 16], "layers": 1, "heads": 2, "output_dim": 16},
-        "state_encoder": {"dim": 16, "layers": 1, "heads": 2, "output_dim": 16},
-        "expert": {"dim": 16, "layers": 1, "heads": 2},
-    }
-)
-STREAMS = (
-    "feature_age",
-    "sensor",
-    "sensor_valid",
-    "state",
-    "state_valid",
-    "action",
-    "action_valid",
-)
-
-
-@pytest.fixture(scope="module")
-def live(recordings: Path) -> UnifiedVLADataset:
-    return UnifiedVLADataset(sources(recordings))
+VIEWS = ("View1", "View2")
+TEXT = ["insert the needle", "stop", "insert the needle", "retract"]
+SMALL: dict[str, Any] = {
+    "image_resize_height": 56,
+    "image_resize_width": 84,
+    "views": VIEWS,
+    "pooling": ["mean", "view_mean"],
+    "sensor_channels": 9,
+    "sensor_window": 13,
+    "state_window": 25,
+    "vlm": {"dtype": "float32"},
+    "sensor_encoder": {"channels": [16, 32], "layers": 1, "heads": 2, "output_dim": 24},
+    "state_encoder": {"dim": 16, "layers": 1, "heads": 2, "output_dim": 20},
+    "expert": {"dim": 32, "layers": 1, "heads": 2, "dropout": 0.0},
+}
 
 
-@pytest.fixture(scope="module")
-def cached(recordings: Path, extracted: FeatureStore) -> UnifiedVLADataset:
-    return UnifiedVLADataset(sources(recordings), store=extracted)
+@pytest.fixture(autouse=True)
+def _seeded() -> None:
+    torch.manual_seed(0)
 
 
-@pytest.fixture(scope="module")
-def new(recordings: Path) -> UnifiedVLADataset:
-    return UnifiedVLADataset(recordings / "new", "new")
+def small_policy(shape: PolicyShape) -> Policy:
+    """A policy of the sizes of `SMALL`, without normalization."""
+    sizes = {name: value for name, value in SMALL.items() if name in TrainHeadParams.model_fields}
+    return Policy(TrainHeadParams.model_validate(sizes), shape, no_normalization(shape))
 
 
-def sources(recordings: Path) -> list[Source]:
-    """The new ones first: the store has them last."""
-    return [Source(name=name, path=str(recordings / name)) for name in ("new", "old")]
+@pytest.fixture
+def build(demo_checkpoint: Path) -> Callable[..., QwenVLAUnified]:
+    """`build(**arguments)`: a small unified model on the demo's checkpoint, from a fixed seed."""
 
-
-def same(a: Any, b: Any) -> bool:
-    if isinstance(a, torch.Tensor):
-        return torch.equal(a, b)
-    if isinstance(a, dict):
-        return a.keys() == b.keys() and all(np.array_equal(a[view], b[view]) for view in a)
-    return a == b
-
-
-def equal(a: Any, b: Any) -> bool:
-    """Whether two batches, or two samples, say the same."""
-    a, b = (value if isinstance(value, dict) else vars(value) for value in (a, b))
-    return a.keys() == b.keys() and all(
-        len(a[name]) == len(b[name]) and all(map(same, a[name], b[name]))
-        if isinstance(a[name], list)
-        else same(a[name], b[name])
-        for name in a
-    )
-
-
-class TestItems:
-    def test_an_item_is_what_the_timeline_says(
-        self, recordings: Path, new: UnifiedVLADataset
-    ) -> None:
-        source = Source(name="new", path=str(recordings / "new"))
-        recording = open_recordings([source]).recordings[1]
-        state, sensor = recording.state(), recording.sensor()
-        assert state is not None and sensor is not None
-        line = build_timeline(recording, 10.0, 3, "rotvec", state, sensor)
-        offset = new.episodes[1].ticks.start
-        for tick in (0, 1, 7, len(line.time) - 3):
-            item = new[offset + tick]
-            now = line.time[tick]
-            assert float(item["time"]) == now
-            readings = sensor.values[sensor.time <= now][-65:]
-            assert item["sensor_valid"] == len(readings)
-            assert np.array_equal(item["sensor"][65 - len(readings) :], readings)
-            assert not item["sensor"][: 65 - len(readings)].any()
-            states = state.values[state.time <= now][-100:]
-            assert item["state_valid"] == len(states)
-            assert np.array_equal(item["state"][100 - len(states) :], states)
-            ahead = line.action[tick : tick + 8]
-            assert np.array_equal(item["action"][: len(ahead)], ahead)
-            assert item["action_valid"].sum() == len(ahead)
-            assert item["instruction"] == recording.instruction
-            shown = line.vl_time[line.vl_row[tick]]
-            for view, camera in recording.cameras().items():
-                index = int(np.flatnonzero(camera.time <= shown)[-1])
-                (frame,) = camera.read([index])
-                assert np.array_equal(item["images"][view], frame)
-
-    def test_frames_and_features_come_with_the_same_streams(
-        self, live: UnifiedVLADataset, cached: UnifiedVLADataset
-    ) -> None:
-        assert len(live) == len(cached) == len(live.ticks)
-        items = list(range(0, len(live), 5))
-        a, b = live.__getitems__(items), cached.__getitems__(items)
-        for name in STREAMS:
-            assert torch.equal(getattr(a, name), getattr(b, name)), name
-        assert a.instruction == b.instruction
-        assert a.features.shape == (len(items), 0, 0) and a.key is None and a.images is not None
-        assert b.features.shape[1:] == cached.store.feature_shape and b.images is None
-        rows = b.vl_row.numpy()
-        assert b.key is not None
-        assert np.array_equal(b.key.numpy(), cached.store.array("vl/key")[rows])
-
-    def test_samples_make_the_batch_that_is_read_in_one_go(
-        self, live: UnifiedVLADataset, cached: UnifiedVLADataset
-    ) -> None:
-        for data in (live, cached):
-            items = [0, 1, 2, len(data) - 1, 40]
-            batch = unified_collate_fn(data.__getitems__(items))
-            again = unified_collate_fn([data[item] for item in items])
-            assert isinstance(batch, Batch) and isinstance(batch, Observation)
-            assert equal(batch, again)
-            assert equal(batch, unified_collate_fn(list(batch)))
-            with pytest.raises(IndexError):
-                batch[len(items)]
-
-    def test_a_row_is_decoded_once_for_the_ticks_that_share_it(
-        self, live: UnifiedVLADataset
-    ) -> None:
-        batch = live.__getitems__([0, 1, 2, 3])
-        assert batch.images is not None
-        assert batch.vl_row.tolist() == [0, 0, 0, 1]
-        assert batch.images[0] is batch.images[2]
-        assert batch.images[0] is not batch.images[3]
-
-    def test_a_missing_view_is_absent_and_a_missing_stream_counts_nothing(
-        self, copied: Callable[[str], Path]
-    ) -> None:
-        folder = copied("new")
-        first = sorted((folder / "Red_point").iterdir())[0]
-        for image in (first / "images" / "View2").iterdir():
-            image.unlink()
-        metadata = json.loads((first / "metadata.json").read_text())
-        metadata["camera_views"] = ["View1"]
-        (first / "metadata.json").write_text(json.dumps(metadata))
-        (first / "sensor_data.npz").unlink()
-        data = UnifiedVLADataset(folder)
-        item, other = data[0], data[len(data) - 1]
-        assert "View2" not in item["images"] and "View2" in other["images"]
-        assert item["sensor_valid"] == 0 and other["sensor_valid"] == 65
-        assert not item["sensor"].any() and item["sensor"].shape == (65, 1026)
-
-    def test_views_and_windows_are_as_asked_for(self, recordings: Path) -> None:
-        data = UnifiedVLADataset(
-            recordings / "new", "new", 4, 2, 30, 20, 5.0, views=["View1"], instruction="go"
-        )
-        item = data[10]
-        assert list(item["images"]) == ["View1"] and item["instruction"] == "go"
-        assert item["action"].shape == (4, 7) and item["vl_row"] == 5
-        assert item["sensor"].shape == (30, 1026) and item["state"].shape == (20, 12)
-        assert float(data[1]["time"] - data[0]["time"]) == pytest.approx(0.2)
-
-
-class TestOneActionRotation:
-    def test_old_and_new_have_rotation_vectors_where_both_have_poses(
-        self, live: UnifiedVLADataset
-    ) -> None:
-        assert live.store.streams["action"]["names"][3:6] == ["rx", "ry", "rz"]
-
-    def test_old_without_poses_makes_euler_deltas_of_all(
-        self, copied: Callable[[str], Path], recordings: Path
-    ) -> None:
-        old = copied("old")
-        for states in old.glob("**/robot_states.npz"):
-            states.unlink()
-        data = UnifiedVLADataset([old, recordings / "new"])
-        assert data.store.streams["action"]["names"][3:6] == ["da", "db", "dr"]
-        with pytest.raises(StoreMismatch, match=r"action.*da.*rx|action.*rx.*da"):
-            UnifiedVLADataset([old, recordings / "new"], action_rotation="rotvec")
-
-    def test_real_recordings_of_both_formats(self, shared_data: Path) -> None:
-        root = shared_data / "insertion"
-        data = UnifiedVLADataset([root / "old", root / "new"])
-        assert {one.format for one in data.episodes} == {"old", "new"}
-        batch = unified_collate_fn([data[item] for item in range(0, len(data), 7)])
-        assert batch.images is not None and all(batch.images)
-        assert batch.action.shape[1:] == (8, 7)
-        assert batch.sensor.shape[1:] == (65, 1026)
-        # The old recordings have no robot states: Euler deltas for both.
-        assert data.store.streams["action"]["names"][3:6] == ["da", "db", "dr"]
-
-
-class TestStore:
-    def test_an_alias_takes_the_episodes_of_its_format(
-        self, extracted: FeatureStore, recordings: Path
-    ) -> None:
-        old = AsyncInsertionMeca500DatasetWithSensor(store=extracted)
-        new = NewAsyncInsertionDataset(store=extracted.path)
-        assert {one.format for one in old.episodes} == {"old"}
-        assert {one.format for one in new.episodes} == {"new"}
-        assert len(old) + len(new) == extracted.ticks
-        assert isinstance(new, UnifiedVLADataset)
-        assert async_collate_fn_with_sensor is unified_collate_fn
-        again = NewAsyncInsertionDataset(recordings / "new", store=extracted)
-        assert np.array_equal(again.ticks, new.ticks)
-        assert [one.source for one in again.episodes] == ["new", "new"]
-
-    def test_recordings_that_it_lacks_are_named(
-        self, copied: Callable[[str], Path], extracted: FeatureStore
-    ) -> None:
-        folder = copied("new")
-        episode = sorted((folder / "Red_point").iterdir())[0]
-        episode.rename(episode.with_name("episode_20990101_000000"))
-        with pytest.raises(StoreMismatch, match=r"episode_20990101_000000.*stages\.extract"):
-            UnifiedVLADataset(folder, store=extracted)
-
-    @pytest.mark.parametrize(
-        ("settings", "said"),
-        [
-            ({"vlm_reuse_count": 5}, "vlm_reuse_count: 5 expected, found 3"),
-            ({"action_rotation": "euler_delta"}, '"euler_delta" expected, found "rotvec"'),
-            ({"format": "lerobot"}, "'lerobot', found new, old"),
-        ],
-    )
-    def test_settings_of_other_ticks_are_refused(
-        self, extracted: FeatureStore, settings: dict[str, Any], said: str
-    ) -> None:
-        with pytest.raises(StoreMismatch, match=said):
-            UnifiedVLADataset(store=extracted, **settings)
-
-
-class TestErrors:
-    def test_what_contradicts_itself(self, extracted: FeatureStore, recordings: Path) -> None:
-        with pytest.raises(ConfigError, match="recordings or a store"):
-            UnifiedVLADataset()
-        with pytest.raises(ConfigError, match="views"):
-            UnifiedVLADataset(store=extracted, views=["View1"])
-        with pytest.raises(ConfigError, match="recordings or a store"):
-            UnifiedVLADataset(recordings=[], store=extracted)
-        opened = open_recordings(sources(recordings)).recordings
-        for doubled in ({"data": recordings}, {"instruction": "go"}, {"views": ["View1"]}):
-            with pytest.raises(ConfigError, match="open already"):
-                UnifiedVLADataset(recordings=opened, **doubled)
-        with pytest.raises(ConfigError, match="horizon=0"):
-            UnifiedVLADataset(recordings / "new", horizon=0)
-        wrong: Any = "newest"
-        with pytest.raises(ConfigError, match=r"format: .*old.*'newest'"):
-            UnifiedVLADataset(recordings / "new", wrong)
-        with pytest.raises(ConfigError, match=r"action_rotation: .*rotvec.*'newest'"):
-            UnifiedVLADataset(recordings / "new", action_rotation=wrong)
-
-    def test_two_embodiments_are_refused_naming_both(
-        self, recordings: Path, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        """Of the same channels, but what they mean differs."""
-
-        def other(one: WindowedRecording) -> RecordedAction | None:
-            poses = one.poses()
-            if one.path.name != last or poses is None:
-                return None
-            names = ("dx", "dy", "dz", "rx", "ry", "rz", "gripper")
-            channels = Channels(names, ("mm",) * 3 + ("deg",) * 3 + ("",))
-            values = np.zeros((len(poses.time), 7), np.float32)
-            return RecordedAction(channels, poses.time, values, "absolute", None)
-
-        last = max(path.name for path in (recordings / "new" / "Red_point").iterdir())
-        monkeypatch.setattr(WindowedRecording, "action", other)
-        with pytest.raises(StoreMismatch, match=r"7 delta channels.*7 absolute channels.*Make two"):
-            UnifiedVLADataset(recordings / "new")
-
-    def test_frames_beside_features(
-        self, live: UnifiedVLADataset, cached: UnifiedVLADataset
-    ) -> None:
-        for samples in ([live[0], cached[0]], [cached[0], live[0]]):
-            with pytest.raises(StoreMismatch, match="1 of its 2 samples"):
-                unified_collate_fn(samples)
-
-    def test_what_is_not_there(self, tmp_path: Path, recordings: Path) -> None:
-        with pytest.raises(RecordingError, match="nowhere"):
-            UnifiedVLADataset(tmp_path / "nowhere")
-        with pytest.raises(RecordingError, match="old"):
-            AsyncInsertionMeca500DatasetWithSensor(recordings / "new")
-        with pytest.raises(StoreIncomplete, match=r"nowhere\.zarr"):
-            UnifiedVLADataset(store=tmp_path / "nowhere.zarr")
-
-    def test_every_broken_episode_is_named(self, copied: Callable[[str], Path]) -> None:
-        folder = copied("new")
-        for metadata in folder.glob("**/metadata.json"):
-            metadata.write_text("{")
-        with pytest.raises(
-            RecordingError, match=r"(?s)2 episodes.*_092140/metadata.*_092320/metadata"
-        ):
-            UnifiedVLADataset(folder)
-
-
-class TestSplit:
-    def test_whole_episodes_on_either_side(
-        self, live: UnifiedVLADataset, cached: UnifiedVLADataset
-    ) -> None:
-        train, held_out = live.split(0.3)
-        assert sorted(train.indices + held_out.indices) == list(range(len(live)))
-        sides = [set(live.__getitems__(s.indices).episode.tolist()) for s in (train, held_out)]
-        assert sides[0] and sides[1] and not sides[0] & sides[1]
-        loader = DataLoader(held_out, batch_size=50, collate_fn=unified_collate_fn)
-        assert len(next(iter(loader))) == min(50, len(held_out))
-        both = cached.split(0.3)
-        assert sorted(both[0].indices + both[1].indices) == list(range(len(cached)))
-
-    def test_the_same_with_frames_as_with_features_under_the_names_of_the_store(
-        self, recordings: Path, extracted: FeatureStore
-    ) -> None:
-        named = [
-            Source(name=name, path=str(recordings / folder))
-            for name, folder in (("first", "old"), ("second", "new"))
-        ]
-        live, cached = UnifiedVLADataset(named), UnifiedVLADataset(store=extracted)
-        for val_fraction in (0.0, 0.3, 0.5, 0.8):
-            sides = [[side.indices for side in data.split(val_fraction)] for data in (live, cached)]
-            assert sides[0] == sides[1]
-            trained = split_by_episode(extracted, SplitParams(val=val_fraction, test=0))
-            assert sides[1] == [trained.train.tolist(), trained.val.tolist()]
-
-    def test_nothing_is_written_into_the_store(
-        self, recordings: Path, extracted: FeatureStore
-    ) -> None:
-        for data in (UnifiedVLADataset(recordings / "new"), UnifiedVLADataset(store=extracted)):
-            arrays = {name: data.store.array(name) for name in ("vl/key", "tick/vl_row")}
-            before = {name: array.copy() for name, array in arrays.items()}
-            data.split(0.3)
-            for name, array in arrays.items():
-                assert data.store.array(name) is array
-                np.testing.assert_array_equal(array, before[name])
-
-    def test_one_recording_in_two_places_is_on_one_side(self, recordings: Path) -> None:
-        new = str(recordings / "new")
-        twice = [Source(name="a", path=new), Source(name="b", path=new)]
-        data = UnifiedVLADataset(twice)
-        _, held_out = data.split(0.5)
-        held = set(held_out.indices)
-        half = len(data) // 2
-        assert held and {item + half for item in held if item < half} <= held
-
-
-class TestWorkers:
-    @pytest.mark.parametrize(("start", "workers"), [("fork", 2), ("spawn", 1)])
-    def test_batches_are_those_of_this_process(
-        self, new: UnifiedVLADataset, start: str, workers: int
-    ) -> None:
-        loader = DataLoader(
-            new,
-            batch_sampler=[[0, 1, 5], [70, 40], [3]],
-            num_workers=workers,
-            collate_fn=unified_collate_fn,
-            multiprocessing_context=start,
-        )
-        for batch, items in zip(loader, loader.batch_sampler, strict=True):
-            assert equal(batch, new.__getitems__(items))
-
-    def test_recordings_that_are_open_already_are_the_same_data(
-        self, recordings: Path, extracted: FeatureStore, live, cached
-    ) -> None:
-        opened = open_recordings(sources(recordings)).recordings
-        for ours, theirs in (
-            (UnifiedVLADataset(recordings=opened), live),
-            (UnifiedVLADataset(recordings=opened, store=extracted), cached),
-        ):
-            assert len(ours) == len(theirs) and equal(ours[3], theirs[3])
-            assert equal(pickle.loads(pickle.dumps(ours))[3], theirs[3])
-        one = UnifiedVLADataset(recordings=opened[1:2])
-        assert [each.id for each in one.episodes] == [opened[1].id]
-
-    def test_a_pickle_opens_the_data_again(
-        self, live: UnifiedVLADataset, cached: UnifiedVLADataset
-    ) -> None:
-        for data in (live, cached):
-            sent = pickle.dumps(data)
-            assert len(sent) < 4096
-            assert equal(pickle.loads(sent)[3], data[3])
-        alias = AsyncInsertionMeca500DatasetWithSensor(store=cached.store)
-        again = pickle.loads(pickle.dumps(alias))
-        assert type(again) is type(alias) and np.array_equal(again.ticks, alias.ticks)
-
-    def test_data_sets_concatenate(self, recordings: Path, new: UnifiedVLADataset) -> None:
-        parts = [NewAsyncInsertionDataset(path) for path in sorted(recordings.glob("new/*/*"))]
-        loader = DataLoader(ConcatDataset(parts), batch_size=90, collate_fn=unified_collate_fn)
-        batches = list(loader)
-        expected = new.__getitems__(range(len(new)))
-        action = torch.cat([batch.action for batch in batches])
-        assert torch.equal(action, expected.action)
-
-
-class TestModels:
-    def test_a_policy_takes_a_batch_of_either_kind(
-        self, live: UnifiedVLADataset, cached: UnifiedVLADataset
-    ) -> None:
-        for data in (live, cached):
-            batch = data.__getitems__([0, 50, 120])
-            views = len(cached.store.streams["views"])
-            sizes = (*cached.store.feature_shape, 1026, 12, 7)
-            shape = PolicyShape(*sizes, ("other",) * 7, views=views)
-            if data is live:
-                shape = replace(shape, slots=0, feature_dim=0)
-            loss, _ = Policy(SMALL, shape, no_normalization(shape)).loss(
-                batch, batch.action, batch.action_valid
-            )
-            assert torch.isfinite(loss)
-
-    def test_the_unified_model_says_the_same_of_frames_and_of_features(
-        self, live: UnifiedVLADataset, cached: UnifiedVLADataset, demo_checkpoint: Path
-    ) -> None:
+    def make(kind: type[QwenVLAUnified] = QwenVLAUnified, **arguments: Any) -> QwenVLAUnified:
         torch.manual_seed(0)
-        model = QwenVLAUnified(
-            "regression",
-            vl_model_name=str(demo_checkpoint),
-            image_resize_height=56,
-            image_resize_width=56,
-            views=cached.store.streams["views"],
-            vlm={"dtype": "float32"},
-            **SMALL.model_dump(include={"sensor_encoder", "state_encoder", "expert"}),
-        ).eval()
-        losses = [model(**data.__getitems__([0, 1, 90, 150]).inputs()) for data in (live, cached)]
-        assert losses[0].item() == pytest.approx(losses[1].item(), rel=1e-3)
+        return kind(**(SMALL | {"vl_model_name": str(demo_checkpoint)} | arguments)).eval()
+
+    return make
 
 
-def test_a_batch_moves_with_what_is_not_a_tensor(live: UnifiedVLADataset) -> None:
-    batch = live.__getitems__([0, 9])
-    moved = batch.to("meta")
-    assert moved.sensor.is_meta and moved.tick.is_meta
-    assert moved.images is batch.images and moved.instruction == batch.instruction
+@pytest.fixture(scope="module")
+def images() -> list[dict[str, NDArray[np.uint8]]]:
+    """Frames of four samples: the third shows what the first does, the last has one view."""
+    rng = np.random.default_rng(0)
+    frames = [
+        {view: rng.integers(0, 255, (60, 90, 3), np.uint8) for view in VIEWS} for _ in range(3)
+    ]
+    again = {view: frame.copy() for view, frame in frames[0].items()}
+    return [frames[0], frames[1], again, {"View2": frames[2]["View2"]}]
+
+
+@pytest.fixture
+def streams() -> dict[str, Tensor]:
+    return {"sensor": torch.randn(4, 13, 9), "state": torch.randn(4, 25, 12)}
+
+
+def _cached(
+    model: QwenVLAUnified, images: list[Any], dtype: str = "float32"
+) -> tuple[Tensor, Tensor]:
+    """What stage one stores for these samples."""
+    vlm = model.vlm_params
+    spec = live_spec(vlm, VIEWS)
+    preparer = Preparer(vlm, spec)
+    rows = [preparer.prepare(text, frames) for text, frames in zip(TEXT, images, strict=True)]
+    features, valid = FrozenVLM.load(vlm, spec, "cpu").encode(rows)
+    return features.to(getattr(torch, dtype)), valid
+
+
+@pytest.mark.parametrize("model_type", ["regression", "diffusion", "flow_matching"])
+def test_live_cached_and_mixed_give_the_same_chunk(
+    build: Callable[..., QwenVLAUnified],
+    images: list[Any],
+    streams: dict[str, Tensor],
+    model_type: str,
+) -> None:
+    model = build(model_type=model_type)
+    features, slot_valid = _cached(model, images)
+
+    def act(*args: Any, **over: Any) -> Tensor:
+        generator = torch.Generator().manual_seed(3)
+        return model(*args, **streams, generator=generator, **over)
+
+    cached = act(features=features, slot_valid=slot_valid)
+    assert cached.shape == (4, 8, 7)
+    assert model.vlm is None, "a model used with cached features reads no checkpoint"
+    live = act(images, TEXT)
+    assert model.vlm is not None
+    torch.testing.assert_close(live, cached, atol=2e-4, rtol=1e-3)
+
+    mixed = features.clone()
+    mixed[[0, 3]] = torch.nan
+    part = [images[0], None, None, images[3]]
+    both = act(part, TEXT, features=mixed, slot_valid=slot_valid)
+    torch.testing.assert_close(both, cached, atol=2e-4, rtol=1e-3)
+    other = act([images[1], *images[1:]], TEXT)
+    assert (other[0] - cached[0]).abs().max() > 1e-3, "the chunk depends on what is seen"
+
+
+def test_bfloat16_live_and_cached_agree_within_its_noise(
+    build: Callable[..., QwenVLAUnified], images: list[Any], streams: dict[str, Tensor]
+) -> None:
+    model = build(model_type="regression", vlm={"dtype": "bfloat16"})
+    features, slot_valid = _cached(model, images, "bfloat16")
+    cached = model(features=features, slot_valid=slot_valid, **streams)
+    live = model(images, TEXT, **streams)
+    assert ((live - cached).norm() / cached.norm()) < 0.03
+
+
+def test_equal_samples_share_a_row(build: Callable[..., QwenVLAUnified], images: list[Any]) -> None:
+    model = build()
+    observation = model.observe(images, TEXT)
+    assert isinstance(observation, LiveObservation)
+    assert observation.row_of.tolist() == [0, 1, 0, 2]
+    assert len(observation.rows) == 3
+    said = model.observe(images, ["insert the needle", "stop", "retract", "retract"])
+    assert said.row_of.tolist() == [0, 1, 2, 3]
+    pictures = [{view: Image.fromarray(f) for view, f in frames.items()} for frames in images]
+    assert model.observe(pictures, TEXT).row_of.tolist() == [0, 1, 0, 2]
+    batches: list[int] = []
+    model.load_vlm().register_forward_pre_hook(lambda _, given: batches.append(len(given[0])))
+    model.sample(observation, 3)
+    assert batches == [3]
+
+
+def test_what_is_not_given_is_missing(
+    build: Callable[..., QwenVLAUnified], streams: dict[str, Tensor]
+) -> None:
+    model = build()
+    observation = model.observe(sensor=streams["sensor"])
+    assert not observation.slot_valid.any()
+    assert observation.sensor_valid.tolist() == [13] * 4
+    assert observation.state_valid.tolist() == [0] * 4
+    assert model(sensor=streams["sensor"]).isfinite().all()
+
+
+def test_a_stream_without_an_encoder_is_not_looked_at(
+    build: Callable[..., QwenVLAUnified], streams: dict[str, Tensor]
+) -> None:
+    model = build(model_type="regression", sensor_enabled=False)
+    torch.testing.assert_close(model(**streams), model(state=streams["state"]))
+    assert model(sensor=torch.randn(3, 2), state=streams["state"]).shape == (4, 8, 7)
+
+
+@pytest.mark.parametrize("name", ["sensr", "sensor_vaild", "action_vaild"])
+def test_a_misspelt_argument_is_refused(
+    build: Callable[..., QwenVLAUnified], streams: dict[str, Tensor], name: str
+) -> None:
+    model = build()
+    for door in (model, model.observe):
+        with pytest.raises(TypeError, match=name):
+            door(**streams, **{name: torch.ones(4)})
+
+
+@pytest.mark.parametrize(
+    "given",
+    [
+        {},
+        {"images": [None, None]},
+        {"images": []},
+        {"text": TEXT},
+        {"feature_age": torch.rand(4)},
+        {"actions": torch.randn(4, 8, 7)},
+    ],
+)
+def test_nothing_to_look_at_is_refused(
+    build: Callable[..., QwenVLAUnified], given: dict[str, Any]
+) -> None:
+    with pytest.raises(ObservationError, match="images or at least one of features, sensor, state"):
+        build()(**given)
+    with pytest.raises(
+        ObservationError, match="images or at least one of features, state, found none"
+    ):
+        build(sensor_enabled=False)(sensor=torch.randn(4, 13, 9))
+
+
+@pytest.mark.parametrize("to", [torch.Tensor.numpy, torch.Tensor.tolist, torch.Tensor.clone])
+def test_validity_is_taken_as_a_store_has_it(
+    build: Callable[..., QwenVLAUnified], streams: dict[str, Tensor], to: Callable[[Tensor], Any]
+) -> None:
+    model = build(model_type="regression")
+    features = torch.randn(4, 3, 128)
+    real = torch.tensor([[1, 0, 1], [0, 0, 0], [1, 1, 1], [0, 1, 0]])
+    counts = torch.tensor([13, 0, 5, 1])
+    expected = model(features=features, slot_valid=real.bool(), sensor_valid=counts, **streams)
+    found = model(
+        features=features, slot_valid=to(real.byte()), sensor_valid=to(counts.int()), **streams
+    )
+    assert torch.equal(found, expected)
+    assert not torch.equal(found, model(features=features, **streams))
+    steps = torch.arange(8).expand(4, -1) < torch.tensor([[8], [3], [1], [5]])
+    losses = [
+        model(**streams, actions=torch.ones(4, 8, 7), action_valid=given)
+        for given in (steps, to(steps.byte()))
+    ]
+    assert torch.equal(*losses)
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"features": (4, 3, 100)}, r"features: .*\(batch 4, slot 3, dim 128\), found \(4, 3, 100"),
+        ({"features": (4, 5, 128)}, r"features: .*slot 3, .* found \(4, 5, 128\)"),
+        ({"features": (3, 3, 128)}, r"sensor: .*batch 3, .* found \(4, 13, 9\).* that of features"),
+        (
+            {"features": (4, 3, 128), "slot_valid": (4, 2)},
+            r"slot_valid: .*slot 3\), found \(4, 2\)",
+        ),
+        ({"feature_age": (4, 1)}, r"feature_age: .*\(batch 4\), found \(4, 1\)"),
+        ({"sensor": (4, 13, 8)}, r"sensor: .*window any, channel 9\), found \(4, 13, 8\)"),
+        ({"sensor": (4, 0, 9)}, r"sensor: .*window any, .* found \(4, 0, 9\)"),
+        ({"sensor": ()}, r"sensor: .* found \(\)"),
+        ({"sensor_valid": (4, 13)}, r"sensor_valid: .*\(batch 4\), found \(4, 13\)"),
+        ({"state": (4, 20, 11)}, r"state: .*window any, channel 12\), found \(4, 20, 11\)"),
+        ({"state_age": (4, 20)}, r"state_age: .*window 25\), found \(4, 20\)"),
+        ({"state": (5, 25, 12)}, r"state: .*batch 4, .* found \(5, .*that of sensor"),
+        ({"state_valid": (2,)}, r"state_valid: .*\(batch 4\), found \(2,\)"),
+        ({"actions": (4, 9, 7)}, r"actions: .*horizon 8, channel 7\), found \(4, 9, 7\)"),
+        ({"actions": (3, 8, 7)}, r"actions: .*batch 4, .* found \(3, 8, 7\)"),
+        (
+            {"actions": (4, 8, 7), "action_valid": (4, 7)},
+            r"action_valid: .*\(batch 4, horizon 8\), found \(4, 7\)",
+        ),
+        ({"slot_valid": (4, 3)}, "slot_valid: expected features beside it"),
+    ],
+)
+def test_a_shape_that_does_not_fit_is_named(
+    build: Callable[..., QwenVLAUnified],
+    streams: dict[str, Tensor],
+    given: dict[str, tuple[int, ...]],
+    message: str,
+) -> None:
+    with pytest.raises(ObservationError, match=message):
+        build()(**(streams | {name: torch.ones(size) for name, size in given.items()}))
+
+
+def test_images_text_and_streams_are_of_one_batch(
+    build: Callable[..., QwenVLAUnified], images: list[Any], streams: dict[str, Tensor]
+) -> None:
+    model = build()
+    for text in (None, TEXT[:3], "stop"):
+        with pytest.raises(ObservationError, match="text: expected 4 instructions"):
+            model(images, text, **streams)
+    for some in (images[:3], [None] * 3):
+        with pytest.raises(ObservationError, match=r"images: .*\(batch 4\), found \(3,\)"):
+            model(some, TEXT[:3], **streams)
+
+
+@pytest.mark.parametrize("model_type", ["regression", "diffusion", "flow_matching"])
+def test_a_fresh_model_acts_without_dropout(
+    build: Callable[..., QwenVLAUnified],
+    images: list[Any],
+    streams: dict[str, Tensor],
+    model_type: str,
+) -> None:
+    over: dict[str, Any] = {"expert": SMALL["expert"] | {"dropout": 0.5}, "drop_sensor": 0.5}
+    model = build(model_type=model_type, finetune_vl="lora", **over).train()
+    model.policy.fusion.eval()
+    modes: list[bool] = []
+    for _ in range(2):
+        acted = [model(images, TEXT, **streams, generator=_generator()) for _ in range(2)]
+        assert torch.equal(*acted)
+        # Loaded by the first act, the model is in the mode of the whole.
+        assert model.training and model.policy.expert.training and not model.policy.fusion.training
+        assert model.vlm is not None and all(part.training for part in model.vlm.modules())
+        model.vlm.register_forward_pre_hook(lambda vlm, _: modes.append(vlm.training))
+    assert modes == [False, False]
+    assert torch.equal(model.eval()(images, TEXT, **streams, generator=_generator()), acted[0])
+
+    model.train()
+    actions = torch.randn(4, 8, 7)
+    losses = [model(**streams, actions=actions, generator=_generator()) for _ in range(2)]
+    assert losses[0] != losses[1], "learning drops out"
+    observation = model.observe(images, TEXT)
+    observation.row_of[0] = 9
+    with pytest.raises(IndexError):
+        model.act(observation)
+    assert model.training and model.policy.expert.training
+
+
+def test_it_is_trainable_and_gives_the_loss_where_actions_are_given(
+    build: Callable[..., QwenVLAUnified], images: list[Any], streams: dict[str, Tensor]
+) -> None:
+    model = build(model_type="diffusion")
+    assert isinstance(model, Trainable)
+    assert model.stochastic
+    assert not build(model_type="regression").stochastic
+    observation = model.observe(images, TEXT, **streams)
+    assert model.sample(observation, 5).shape == (5, 4, 8, 7)
+    guide = Guide(torch.ones(4, 8, 7), torch.ones(4, 8))
+    free, guided = (model.act(observation, _generator(), given) for given in (None, guide))
+    assert (guided - 1).square().mean() < 0.5 * (free - 1).square().mean()
+    actions = torch.randn(4, 8, 7)
+    found = model(images, TEXT, **streams, actions=actions, generator=_generator())
+    valid = torch.ones(4, 8, dtype=torch.bool)
+    assert torch.equal(found, model.loss(observation, actions, valid, _generator())[0])
+    masked = model(
+        images, TEXT, **streams, actions=actions, action_valid=~valid, generator=_generator()
+    )
+    assert masked == 0
+    assert dict(model.parameter_table())["vlm, learning"] == 0
+    assert sum(count for _, count in model.parameter_table()) == sum(
+        parameter.numel() for parameter in model.parameters()
+    )
+
+
+def _generator() -> torch.Generator:
+    return torch.Generator().manual_seed(1)
+
+
+@pytest.mark.parametrize("finetune_vl", ["lora", "full"])
+def test_tuning_lowers_the_loss(
+    build: Callable[..., QwenVLAUnified], images: list[Any], finetune_vl: str
+) -> None:
+    model = build(model_type="regression", finetune_vl=finetune_vl, lora_dropout=0.0).train()
+    # Only the vision-language model learns, and an optimizer sees it without asking for it.
+    model.policy.requires_grad_(False)
+    learns = [parameter for parameter in model.parameters() if parameter.requires_grad]
+    assert model.vlm is not None
+    assert len(learns) > 0
+    optimizer = torch.optim.AdamW(learns, lr=1e-2 if finetune_vl == "lora" else 1e-3)
+    # The first and third sample see the same.
+    actions = torch.randn(3, 8, 7)[[0, 1, 0, 2]]
+    losses = []
+    for _ in range(8):
+        loss = model(images, TEXT, actions=actions)
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        losses.append(loss.item())
+    # What a head with random weights lets through is small, but nothing here is noise.
+    assert losses[-1] < 0.98 * losses[0], losses
+
+
+@pytest.mark.parametrize("finetune_vl", ["none", "lora", "full"])
+def test_a_state_dict_restores_it_in_a_fresh_model(
+    build: Callable[..., QwenVLAUnified], images: list[Any], finetune_vl: str
+) -> None:
+    """Whether or not the model in front was loaded when it was saved, and when it is restored."""
+    saved = build(model_type="regression", finetune_vl=finetune_vl)
+    with torch.no_grad():
+        for parameter in saved.parameters():
+            parameter.add_(0.05 * torch.randn_like(parameter))
+    chunk = saved(images, TEXT)
+    restored = build(model_type="regression", finetune_vl=finetune_vl)
+    restored.load_state_dict(saved.state_dict())
+    torch.testing.assert_close(restored(images, TEXT), chunk)
+    restored.load_state_dict(saved.state_dict())
+    torch.testing.assert_close(restored(images, TEXT), chunk)
+    with pytest.raises(RuntimeError, match=r"policy\.expert"):
+        restored.load_state_dict({})
+
+
+def test_a_model_in_use_can_be_pickled(
+    build: Callable[..., QwenVLAUnified], images: list[Any]
+) -> None:
+    model = build(model_type="regression")
+    chunk = model(images, TEXT)
+    torch.testing.assert_close(pickle.loads(pickle.dumps(model))(images, TEXT), chunk)
+
+
+def test_of_two_parts(build: Callable[..., QwenVLAUnified], images: list[Any]) -> None:
+    whole = build(finetune_vl="lora")
+    vlm = whole.load_vlm()
+    model = QwenVLAUnified.of(whole.policy, vlm).eval()
+    assert (model.policy, model.vlm) == (whole.policy, vlm)
+    rows, row_of = Preparer(vlm.vlm, vlm.spec).prepare_distinct(images, TEXT)
+    assert (len(rows), row_of) == (3, [0, 1, 0, 2])
+    torch.manual_seed(0)
+    expected = whole(images, TEXT)
+    torch.manual_seed(0)
+    assert torch.equal(model(images, TEXT), expected)
+
+    memo = {id(p): p for p in model.parameters() if not p.requires_grad}
+    shared = set(memo)
+    twin = copy.deepcopy(model, memo)
+    torch.manual_seed(0)
+    assert torch.equal(twin(images, TEXT), expected)
+    assert {id(p) for p in twin.parameters()} & {id(p) for p in model.parameters()} == shared
+
+    other = small_policy(PolicyShape(5, 16, 9, 12, 7, ("other",) * 7))
+    with pytest.raises(VLMError, match=r"gives 3 feature slots of width 128.* for 5 of width 16"):
+        QwenVLAUnified.of(other, vlm)
+    with pytest.raises(VLMError, match="feature_dim=128"):
+        build(feature_dim=2048).load_vlm()
+
+
+SEEN = VLMParams(
+    checkpoint="of the test",
+    dtype="float32",
+    image_resize_height=56,
+    image_resize_width=84,
+    pooling=("mean", "view_mean"),
+)
+
+
+@pytest.fixture
+def trained(demo_checkpoint: Path) -> Any:
+    """`trained(storage_dtype, **vlm)`: a policy of a checkpoint, of features stored so."""
+
+    def policy(storage_dtype: str, **changed: Any) -> Policy:
+        vlm = SEEN.model_copy(update={"checkpoint": str(demo_checkpoint), **changed})
+        spec = feature_spec(vlm, storage_dtype, VIEWS, file_digest)
+        shape = PolicyShape(len(spec.slots), spec.dim, 9, 12, 7, ("other",) * 7)
+        fresh = small_policy(shape)
+        source = {"feature_spec": json.loads(json.dumps(spec.attrs()))}
+        weights = fresh.state_dict()
+        return PolicyCheckpoint(
+            fresh.params, shape, no_normalization(shape), source, {}, 1, weights
+        ).policy()
+
+    return policy
+
+
+def _live(vlm: VLMParams, views: Sequence[str] = VIEWS) -> LiveVLM:
+    """A model that says what it would compute."""
+    tuning = TuningParams(method="none")
+    return LiveVLM(torch.nn.Identity(), None, live_spec(vlm, views), vlm, tuning)  # type: ignore
+
+
+@pytest.mark.parametrize(
+    ("live", "views", "said"),
+    [
+        ({}, ("View1", "View3"), r'views: \["View1", "View2"\] -> \["View1", "View3"\]'),
+        ({}, ("View1",), "slots: 3 entries -> 2 entries"),
+        ({"image_resize_width": 56}, VIEWS, r"processor.image_size: \[56, 84\] -> \[56, 56\]"),
+        ({"prompt": "{images} {instruction}"}, VIEWS, 'prompt: .* -> "{images} {instruction}"'),
+        ({"layers": (0,)}, VIEWS, r"slots\[0\].layer: 3 -> 0"),
+        ({"pooling": ("last", "view_mean")}, VIEWS, 'slots.*: "mean" -> "last"'),
+        ({"dtype": "bfloat16"}, VIEWS, 'compute_dtype: "float32" -> "bfloat16"'),
+    ],
+)
+def test_a_live_model_of_other_features_than_the_policy_s_is_refused(
+    trained: Callable[..., Policy],
+    demo_checkpoint: Path,
+    live: dict[str, Any],
+    views: tuple[str, ...],
+    said: str,
+) -> None:
+    vlm = SEEN.model_copy(update={"checkpoint": str(demo_checkpoint), **live})
+    with pytest.raises(CheckpointMismatch, match=said):
+        QwenVLAUnified.of(trained("float32"), _live(vlm, views))
+
+
+def test_a_live_model_of_other_weights_is_refused(
+    trained: Callable[..., Policy], demo_checkpoint: Path, tmp_path: Path
+) -> None:
+    other = shutil.copytree(demo_checkpoint, tmp_path / "other")
+    vlm = SEEN.model_copy(update={"checkpoint": str(other)})
+    policy = trained("float32")
+    assert QwenVLAUnified.of(policy, _live(vlm)).policy is policy, "a copy elsewhere is the same"
+    weights = other / "model.safetensors"
+    content = bytearray(weights.read_bytes())
+    content[-1] ^= 1
+    weights.write_bytes(content)
+    with pytest.raises(CheckpointMismatch, match=r'weights: ".*" -> ".*"') as refused:
+        QwenVLAUnified.of(policy, _live(vlm))
+    assert len(str(refused.value).splitlines()) == 3, "nothing else differs"
+
+
+@pytest.mark.parametrize("variants", [1, 2])
+@pytest.mark.parametrize("storage_dtype", ["float32", "float16", "bfloat16"])
+def test_how_features_were_stored_makes_no_live_ones_others(
+    trained: Callable[..., Policy], demo_checkpoint: Path, storage_dtype: str, variants: int
+) -> None:
+    vlm = SEEN.model_copy(update={"checkpoint": str(demo_checkpoint)})
+    policy = trained(storage_dtype, variants=variants)
+    assert QwenVLAUnified.of(policy, _live(vlm)).policy is policy
+
+
+def test_a_live_model_of_a_store_spec_is_the_one_built_by_name(
+    build: Callable[..., QwenVLAUnified], demo_checkpoint: Path
+) -> None:
+    vlm = VLMParams(
+        checkpoint=str(demo_checkpoint),
+        dtype="float32",
+        image_resize_height=56,
+        image_resize_width=84,
+        pooling=("mean", "view_mean"),
+    )
+    spec = live_spec(vlm, VIEWS)
+    live = LiveVLM.load(vlm, spec, TuningParams(method="none"), "cpu")
+    assert build().load_vlm().spec.digest == live.spec.digest
+
+
+def test_the_arguments_it_has_always_had() -> None:
+    model = QwenVLAUnified()
+    params, shape = model.policy.params, model.policy.shape
+    assert (params.model_type, params.fusion_strategy) == ("flow_matching", "concat")
+    assert (params.horizon, params.sensor_window) == (8, 65)
+    sensor, state, expert = params.sensor_encoder, params.state_encoder, params.expert
+    assert sensor.channels == (512, 1024, 1024, 1024)
+    assert (sensor.layers, sensor.heads, sensor.output_dim) == (2, 8, 1024)
+    assert (state.dim, state.layers, state.heads, state.output_dim) == (256, 2, 8, 512)
+    assert (expert.dim, expert.layers, expert.heads) == (512, 4, 8)
+    assert (params.diffusion.timesteps, params.diffusion.schedule) == (100, "cosine")
+    assert params.diffusion.prediction == "epsilon"
+    assert shape == PolicyShape(
+        1, 2048, 1026, 12, 7, ("translation",) * 3 + ("rotation",) * 3 + ("gripper",), views=5
+    )
+    tuning, vlm = model.tuning, model.vlm_params
+    assert (tuning.method, tuning.lora_r, tuning.lora_alpha) == ("none", 16, 32)
+    assert tuning.lora_dropout == 0.05
+    assert vlm.checkpoint == "Qwen/Qwen2.5-VL-3B-Instruct"
+    assert (vlm.image_resize_height, vlm.image_resize_width) == (360, 640)
+    chunk = model.eval()(features=torch.randn(2, 1, 2048), sensor=torch.randn(2, 650, 1026))
+    assert chunk.shape == (2, 8, 7)
+
+
+def test_a_part_that_is_named_in_part_keeps_the_rest_of_it(
+    build: Callable[..., QwenVLAUnified],
+) -> None:
+    params = build(expert={"dim": 32, "heads": 2}, state_encoder={"dim": 16}).policy.params
+    assert (params.expert.dim, params.expert.heads, params.expert.layers) == (32, 2, 4)
+    assert (params.state_encoder.dim, params.state_encoder.output_dim) == (16, 512)
+    with pytest.raises(ValidationError):
+        build(expert=None)
+
+
+@pytest.mark.parametrize("fusion", ["concat", "cross_attention", "gated", "none"])
+def test_every_fusion(
+    build: Callable[..., QwenVLAUnified], streams: dict[str, Tensor], fusion: str
+) -> None:
+    model = build(fusion_strategy=fusion)
+    assert model(features=torch.randn(4, 3, 128), **streams).shape == (4, 8, 7)
+    blind = build(fusion_strategy=fusion, sensor_enabled=False, robot_state_enabled=False)
+    assert list(blind.policy.encoders) == ["features"]
+
+
+@pytest.mark.parametrize(
+    ("alias", "model_type", "finetune_vl"),
+    [
+        (QwenVLAWithSensorDiffusion, "diffusion", "none"),
+        (QwenVLAWithSensor, "regression", "none"),
+        (Not_freeze_QwenVLAWithSensor, "regression", "full"),
+    ],
+)
+def test_aliases_build_the_right_thing(
+    build: Callable[..., QwenVLAUnified],
+    alias: type[QwenVLAUnified],
+    model_type: str,
+    finetune_vl: str,
+) -> None:
+    model = build(alias, horizon=4)
+    assert isinstance(model, QwenVLAUnified)
+    assert (model.policy.params.model_type, model.tuning.method) == (model_type, finetune_vl)
+    assert model(sensor=torch.randn(1, 13, 9)).shape == (1, 4, 7)
+    learns = any(parameter.requires_grad for parameter in model.load_vlm().parameters())
+    assert learns == (finetune_vl == "full")
+
+
+def test_a_wrong_argument_is_refused(build: Callable[..., QwenVLAUnified]) -> None:
+    with pytest.raises(ValidationError, match="horizont"):
+        build(horizont=4)
+    with pytest.raises(ValidationError, match="lora_r"):
+        build(lora_r=0)
+
+
+def test_cached_features_need_no_transformers() -> None:
+    code = """
+import sys
+sys.modules["transformers"] = sys.modules["peft"] = None
+import torch
+from pipeline.models import QwenVLAUnified
+model = QwenVLAUnified(sensor_encoder={"channels": [8], "heads": 1, "output_dim": 8})
+assert model.eval()(features=torch.randn(2, 1, 2048)).shape == (2, 8, 7)
+"""
+    subprocess.run([sys.executable, "-c", code], check=True, capture_output=True)

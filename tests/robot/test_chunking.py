@@ -19,7 +19,7 @@ from pipeline.robot.chunking import (
     ensemble,
     soft_mask,
 )
-from pipeline.robot.guides import stack_guides
+from pipeline.robot.session import stack_guides
 
 MODES = get_args(Chunking)
 HORIZON = 8

@@ -103,10 +103,12 @@ def test_a_late_answer_is_never_taken_for_the_next(
 ) -> None:
     served = served_policy()
     go = threading.Event()
-    served.glance.before = lambda: go.wait(20)
-    with PolicyClient(f"ws://{serving(served).address}", timeout_s=0.3) as client:
-        with pytest.raises(ServerError, match=r"expected an answer within 0\.3 s"):
+    served.glance.before = lambda: go.wait(60)
+    with PolicyClient(f"ws://{serving(served).address}", timeout_s=60) as client:
+        client._timeout_s = 0.1  # of this answer alone, which does not come
+        with pytest.raises(ServerError, match=r"expected an answer within 0\.1 s"):
             client.infer(observe(0))
+        client._timeout_s = 60
         go.set()
         client.reconnect()
         assert client.infer(observe(7))["feature_age_s"] == pytest.approx(0, abs=1e-6)
@@ -182,4 +184,4 @@ def test_another_robot_is_refused_before_it_says_anything(
     server = serving(served_policy())
     with pytest.raises(CheckpointMismatch, match="action_hz"):
         PolicyClient(f"ws://{server.address}", robot={"action_hz": 30.0})
-    assert server.status.json().count('"answered": 0') == 1
+    assert '"answered": 0' in server.status.json(0)

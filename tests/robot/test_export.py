@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import torch
 
-from pipeline.base.config import ExportParams, TrainHeadParams
+from pipeline.base.config import ExportParams, TrainHeadParams, load_params
 from pipeline.base.errors import ConfigError, NumericsError
 from pipeline.policy.checkpoint import PolicyCheckpoint
 from pipeline.policy.normalization import ChannelStatistics, Normalization
@@ -297,14 +297,7 @@ def test_golden_rows_are_judged_too(tmp_path: Path) -> None:
         exported(tmp_path / "head", checkpoint, "torch")
 
 
-@pytest.mark.extra
-def test_int8_is_written_or_refused_with_its_figure(tmp_path: Path) -> None:
-    onnx()
-    folder, checkpoint = tmp_path / "head", checkpoint_of()
-    wide = exported(folder, checkpoint, "onnx", int8=True, int8_tolerance=10.0)
-    off = wide["files"]["head.int8.onnx"]["deviation"]["random"]["std"]
-    assert wide["files"]["head.onnx"]["deviation"]["random"]["std"] < 2e-5 < off
-    with pytest.raises(NumericsError, match=rf"head.int8.onnx: .*found {off:.2g} over random"):
-        exported(folder, checkpoint, "onnx", int8=True, int8_tolerance=off / 2)
-    with pytest.raises(ValueError, match="expected onnx among formats"):
-        ExportParams(formats=("torch",), int8=True)
+def test_int8_is_no_longer_a_key(tmp_path: Path) -> None:
+    (tmp_path / "params.yaml").write_text("data: {sources: []}\nvlm: {checkpoint: model}\n")
+    with pytest.raises(ConfigError, match=r"export\.int8: is no longer a key: .* Remove it"):
+        load_params(tmp_path / "params.yaml", ["export.int8=false"])

@@ -189,7 +189,7 @@ class TestState:
 
     def test_of_a_rotation_training_keeps_nothing_to_compare(self):
         look = look_of([], kinds=("rotation",) * 3 + ("plain",) * 2)
-        look._state._mean, look._state._scale = np.zeros(8), np.ones(8)  # type: ignore
+        look._state = ChannelStatistics(np.zeros(8), np.ones(8), 100)
         look.check({}, np.array([[170.0, 20.0, -90.0, 0.0, 0.0]], np.float32))
 
 

@@ -87,16 +87,30 @@ def test_another_robots_server_is_refused(served_policy: Served, serving: Served
 def test_a_run_in_real_time_over_the_wire_is_recorded(
     served_policy: Served, serving: Served, tmp_path: Path
 ) -> None:
-    """As docs/robot.md says it, with a model that is a stand-in."""
+    """As docs/robot.md says it, with a model that is a stand-in, until five actions are sent."""
+
+    class Arm(SimulatedRobot):
+        acts = 0
+
+        def observe(self) -> dict[str, Any]:
+            return super().observe() | ({"ended": "five actions"} if self.acts == 5 else {})
+
+        def act(self, action: np.ndarray) -> None:
+            super().act(action)
+            self.acts += 1
+
     served = served_policy()
-    robot = SimulatedRobot(seed=78)
-    with PolicyClient(f"ws://{serving(served, fresh=False).address}") as policy, closing(robot):
-        settings = RunSettings(INSTRUCTION, seconds=1.5, missed_in_a_row=100, stalled_s=10.0)
+    robot = Arm(seed=78)
+    address = serving(served, fresh=False).address
+    with PolicyClient(f"ws://{address}", timeout_s=60) as policy, closing(robot):
+        settings = RunSettings(
+            INSTRUCTION, clock_drift_s=60, old_features_s=60, old_frame_s=60, stalled_s=60,
+            missed_in_a_row=10**6, hung_s=60,
+        )  # fmt: skip
         recorder = RunRecorder(tmp_path, policy.metadata, INSTRUCTION, vars(settings))
         report = run_robot(robot, policy, settings, recorder=recorder)
-    assert report.kind is StopKind.TIME, report.reason
-    assert report.ticks + report.left_out >= 15  # more where the last one held it up past the end
-    assert report.answers > 0
+    assert report.kind is StopKind.ENDED, report.reason
+    assert len(report.actions) == 5 and report.answers > 0
     assert report.recording == tmp_path / "run_000000"
     run = json.loads((report.recording / "run.json").read_text())
     sent = report.actions[:, 2:]

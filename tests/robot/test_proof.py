@@ -12,8 +12,7 @@ import torch
 from pipeline.base.config import Params
 from pipeline.base.errors import CheckpointMismatch
 from pipeline.policy.checkpoint import PolicyCheckpoint
-from pipeline.robot.features import LiveFeatures
-from pipeline.robot.proof import prove
+from pipeline.robot.live_features import LiveFeatures, prove
 from pipeline.vlm.deviation import TOLERANCES
 from pipeline.vlm.preparation import Preparer
 from pipeline.vlm.processor import PromptRenderer

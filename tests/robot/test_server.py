@@ -20,7 +20,7 @@ from pipeline.base.config import ServeParams
 from pipeline.base.errors import ConfigError
 from pipeline.robot import wire
 from pipeline.robot.client import PolicyClient
-from pipeline.robot.server import PolicyServer, listen, read_token
+from pipeline.robot.server import PolicyServer, ServerStatus, listen, read_token
 
 Observe = Callable[..., dict[str, Any]]
 Serving = Callable[..., PolicyServer]
@@ -217,8 +217,6 @@ def test_the_token_is_asked_for(served_policy: Served, serving: Serving, observe
         assert client.infer(observe(0))["actions"].shape == (4, 7)
     assert get(server, "/healthz")[0] == 200
     assert get(server, "/status.json", Authorization="Api-Key s3cret")[0] == 200
-    # The page itself says nothing of anybody, and asks for the token.
-    assert "models/head" not in get(server, "/")[1]
 
 
 def test_pages_of_other_places_are_refused(served_policy: Served, serving: Serving) -> None:
@@ -226,16 +224,14 @@ def test_pages_of_other_places_are_refused(served_policy: Served, serving: Servi
     for headers in (
         {"Origin": "https://example.org"},
         {"Origin": "null"},
-        {"Host": "example.org", "Origin": "http://example.org"},  # a name made to mean this machine
-        {"Host": "example.org:8000"},
+        {"Origin": f"http://{server.address}"},
+        {"Host": "example.org:8000"},  # a name made to mean this machine
     ):
         for path in ("/", "/status.json"):
             assert get(server, path, **headers)[0] == 403, headers
     with pytest.raises(InvalidStatus, match="403"), opened(server, origin="https://example.org"):
         pass
-    with opened(server, origin=f"http://{server.address}"):
-        pass
-    assert get(server, "/elsewhere")[0] == 404
+    assert [get(server, path)[0] for path in ("/", "/elsewhere")] == [404, 404]
 
 
 @pytest.mark.parametrize(
@@ -243,9 +239,7 @@ def test_pages_of_other_places_are_refused(served_policy: Served, serving: Servi
     [
         ("/", ["Host: [::1"], "Invalid IPv6 URL"),
         ("//[", ["Host: localhost"], "Invalid IPv6 URL"),
-        ("/", ["Host: localhost", "Origin: http://["], "Invalid IPv6 URL"),
         ("/", ["Host: localhost", "Host: localhost"], "expected the header 'Host' once"),
-        ("/", ["Origin: null", "Origin: null"], "expected the header 'Origin' once"),
         ("/status.json", ["Authorization: a", "Authorization: b"], "'Authorization' once"),
     ],
 )
@@ -261,33 +255,32 @@ def test_a_request_that_no_server_can_read_is_refused_with_a_reason(
     assert "Traceback" not in capfd.readouterr().err
 
 
-def test_the_page_may_run_its_own_script_alone(served_policy: Served, serving: Serving) -> None:
-    server = serving(served_policy())
-    (status, text, headers), again = get(server, "/"), get(server, "/")
-    assert status == 200 and headers["Content-Type"].startswith("text/html")
-    policy = headers["Content-Security-Policy"]
-    assert "default-src 'none'" in policy and "unsafe" not in policy and "http" not in policy
-    nonce = policy.partition("script-src 'nonce-")[2].partition("'")[0]
-    assert len(nonce) > 20 and text.count(f'nonce="{nonce}"') == 2 and nonce not in again[1]
-
-
 def test_status_says_what_happened(
     served_policy: Served, serving: Serving, observe: Observe
 ) -> None:
     server = serving(served_policy())
     assert json.loads(get(server, "/status.json")[1])["latency"] == {}
     with client_of(server) as client:
-        answers = [client.infer(observe(tick, prompt="<b>go</b>")) for tick in range(4)]
-        said = json.loads(get(server, "/status.json")[1])
-        assert said["counts"] == {"answered": 4, "refused": 0, "busy": 0}
+        for tick in range(4):
+            client.infer(observe(tick))
+        _, text, headers = get(server, "/status.json")
+        assert headers["Content-Type"] == "application/json" and headers["Cache-Control"]
+        said = json.loads(text)
+        assert said["counts"] == {"connected": 1, "answered": 4, "refused": 0, "busy": 0}
         assert said["policy"]["checkpoint"] == "models/head"
         for part in ("vlm_ms", "head_ms", "wait_ms", "infer_ms"):
             taken = said["latency"][part]
             assert 0 < taken["p50"] <= taken["p99"] <= taken["p99.9"] <= taken["max"]
-        (robot,) = said["robots"]
-        assert robot["prompt"] == "<b>go</b>" and robot["answers"] == 4
-        assert set(robot["frames"]) == {"View1", "View2", "View5"}
-        np.testing.assert_array_equal(np.float32(robot["actions"]), answers[-1]["actions"])
+
+
+def test_a_part_that_took_no_time_is_not_counted(served_policy: Served) -> None:
+    status = ServerStatus(served_policy().metadata)
+    for ms in range(1, 1001):
+        status.answered({"vlm_ms": 0.0, "head_ms": ms, "wait_ms": 0.0, "infer_ms": 2 * ms})
+    latency = json.loads(status.json(0))["latency"]
+    assert set(latency) == {"head_ms", "infer_ms"}
+    assert latency["head_ms"]["count"] == 1000
+    assert latency["infer_ms"]["p99"] == pytest.approx(1980.02)
 
 
 def test_stopping_answers_what_is_under_way_and_takes_no_more(

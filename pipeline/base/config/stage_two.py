@@ -300,17 +300,6 @@ class ExportParams(Section):
     """onnx: `head.onnx`, for ONNX Runtime. torch: `head.pt2`, for `torch.export.load`."""
     opset: int = Field(default=20, ge=18, le=100)
     """Version of ONNX's operators."""
-    int8: bool = False
-    """Also write `head.int8.onnx`, whose matrix products are in int8."""
-    int8_tolerance: float = Field(default=0.05, gt=0, le=1e3)
-    """Most that it may be off the policy, in training std of the action; else nothing is
-    written."""
-
-    @model_validator(mode="after")
-    def _int8_is_made_from_onnx(self) -> "ExportParams":
-        if self.int8 and "onnx" not in self.formats:
-            raise ValueError("int8: expected onnx among formats, of which it is made")
-        return self
 
 
 class CompareParams(Section):

@@ -1,4 +1,4 @@
-"""The newest readings and features of one robot, as a policy takes them. Numpy only."""
+"""What a policy remembers of one robot: its newest readings and features. Numpy only."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -16,27 +16,27 @@ if TYPE_CHECKING:
 class ReadingWindow:
     """The newest readings of a stream (reading, channel) and their times (reading,), oldest first.
 
-    Right-aligned: where none has come yet, values are 0 and times -inf.
+    Readings stand at the end; before the first one values are 0 and times -inf.
     """
 
     def __init__(self, readings: int, channels: int, oldest_s: float | None) -> None:
-        """`oldest_s` is how old a reading of the window may be; None: any age."""
+        """A reading older than `oldest_s` is not valid; None allows any age."""
         self.values = np.zeros((readings, channels), np.float32)
         self.time_s = np.full(readings, -np.inf)
         self._oldest_s = np.inf if oldest_s is None else oldest_s + CLOCK_SLACK_S
 
     def append(self, readings: NDArray[np.float32], time_s: NDArray[np.float64]) -> None:
-        """Take the readings (reading, channel) that follow, and the times (reading,) of them."""
+        """Add the next readings (reading, channel) and their times (reading,)."""
         kept = len(self.time_s)
         self.values = np.concatenate([self.values, readings], dtype=np.float32)[-kept:]
         self.time_s = np.concatenate([self.time_s, time_s])[-kept:]
 
     def at(self, now_s: float) -> tuple[NDArray[np.float32], int, NDArray[np.float32]]:
-        """The readings, how many of them are real, the last ones, and their ages in s."""
+        """The readings, how many at the end are valid, and the ages in s; 0 where not valid."""
         age_s = now_s - self.time_s
-        real = np.isfinite(age_s) & (age_s <= self._oldest_s)
-        ages = np.where(real, age_s, 0).astype(np.float32)
-        return self.values * real[:, None], int(real.sum()), ages
+        valid = np.isfinite(age_s) & (age_s <= self._oldest_s)
+        ages = np.where(valid, age_s, 0).astype(np.float32)
+        return self.values * valid[:, None], int(valid.sum()), ages
 
 
 @dataclass(frozen=True)
@@ -46,11 +46,13 @@ class SeenFeatures:
     features: NDArray[np.float32]
     slot_valid: NDArray[np.bool_]
     frame_time_s: NDArray[np.float64]
-    """(view,) in s, NaN of a missing one."""
+    """(view,) in s, NaN of a missing view."""
+    key: bytes = b""
+    """`row_key` of the frames and prompt, where a session computed the features."""
 
 
 class RobotMemory:
-    """What a policy with these windows, by stream, remembers of one robot."""
+    """The windows of one robot by stream, and its newest features."""
 
     def __init__(self, windows: Mapping[str, ReadingWindow]) -> None:
         self._windows = windows
@@ -59,7 +61,7 @@ class RobotMemory:
 
     @classmethod
     def of(cls, policy: "Policy") -> "RobotMemory":
-        """That of a robot that this policy controls."""
+        """An empty memory with the windows of this policy."""
         params, shape = policy.params, policy.shape
         sizes = {
             "sensor": (params.sensor_window, shape.sensor_channels, params.sensor_reach_s),
@@ -68,9 +70,10 @@ class RobotMemory:
         return cls({name: ReadingWindow(*size) for name, size in sizes.items() if size[1]})
 
     def sense(self, readings: Mapping[str, NDArray[Any]]) -> None:
-        """Take what came since the last tick, and `time` (1,) now, in s.
+        """Take the readings since the last tick, and `time` (1,) now, in s.
 
-        `state` and `sensor` are (reading, channel); `state_time` and `sensor_time` (reading,).
+        `state` and `sensor` are (reading, channel), `state_time` and `sensor_time` (reading,). A
+        stream that the policy does not have is ignored.
         """
         self.time_s = float(readings["time"][0])
         for name, window in self._windows.items():
@@ -78,9 +81,9 @@ class RobotMemory:
                 window.append(readings[name], readings[f"{name}_time"])
 
     def observation(self) -> dict[str, NDArray[Any]]:
-        """The fields of an `Observation` of one sample; features are missing until the first came.
+        """The fields of an `Observation` of one sample, without features until the first came.
 
-        Ages are true ones: now, less the time of a reading or of a frame.
+        An age is now less the time of the reading or of the frame.
         """
         fields: dict[str, NDArray[Any]] = {}
         for name, window in self._windows.items():

@@ -11,7 +11,7 @@ from safetensors.torch import load_file, save_file
 from pipeline.base.config import Params
 from pipeline.base.errors import CheckpointMismatch
 from pipeline.data import open_recordings
-from pipeline.robot.features import LiveFeatures
+from pipeline.robot.live_features import LiveFeatures
 from pipeline.store import FeatureStore
 from pipeline.vlm.demo_checkpoint import write_demo_checkpoint
 from pipeline.vlm.live import LiveVLM

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pipeline.robot.timings import Ring, Timings
+from pipeline.robot.run_report import Ring, Timings
 
 
 @pytest.mark.parametrize("rows", [0, 3, 4, 5, 11])

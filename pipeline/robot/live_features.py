@@ -1,0 +1,129 @@
+"""Live features of a policy, and the proof that they come from the model it was trained on.
+
+The feature specs are compared before a weight is loaded. The golden rows see what no spec tells:
+another attention backend or GPU, weights altered in memory, other code that prepares frames.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, UInt8
+from numpy import ndarray
+from numpy.typing import NDArray
+from torch import Tensor
+
+from pipeline.base.commands import command
+from pipeline.base.config import TuningParams, VLMParams
+from pipeline.base.errors import CheckpointMismatch
+from pipeline.base.golden import row_key
+from pipeline.policy.checkpoint import PolicyCheckpoint
+from pipeline.vlm.deviation import slot_deviations, tolerance_of
+from pipeline.vlm.feature_spec import live_differences
+from pipeline.vlm.live import LiveVLM, live_spec, refuse_other_features
+from pipeline.vlm.preparation import Preparer
+from pipeline.vlm.slots import slot_name
+
+_ROWS = 16
+"""Frame sets in one pass of the model."""
+_SHOWN = 6
+"""Slots of a row that a message names."""
+
+
+class LiveFeatures:
+    """The frozen model of `vlm`, which computes a policy's features from live frames."""
+
+    def __init__(self, vlm: VLMParams, trained: Mapping[str, Any], device: str) -> None:
+        """Load the model; `trained` is the feature spec of the policy's checkpoint.
+
+        Raises `CheckpointMismatch`, before a weight is loaded, where the model gives other features
+        than the policy was trained on, and `VLMError` as `LiveVLM.load`.
+        """
+        self.spec = live_spec(vlm, trained["views"])
+        """The spec of the features that this model gives."""
+        refuse_other_features(vlm, trained, self.spec)
+        self._model = LiveVLM.load(vlm, self.spec, TuningParams(method="none"), device).eval()
+        self._preparer = Preparer(vlm, self.spec)
+        self._trained = trained
+
+    def prompt(self, instruction: str, views: Sequence[str]) -> str:
+        """The rendered prompt that goes with frames of these views."""
+        return self._preparer.render(instruction, views)
+
+    def key(self, frames: Mapping[str, NDArray[np.uint8]], instruction: str) -> bytes:
+        """The key (16 bytes) of these frames in the store that the policy was trained on."""
+        prompt = self.prompt(instruction, list(frames))
+        return row_key(self._trained["digest"], self._trained["views"], prompt, frames)
+
+    @torch.inference_mode()
+    def __call__(
+        self, frames: Sequence[Mapping[str, "UInt8[ndarray, 'height width 3']"]], instruction: str
+    ) -> tuple[Float[Tensor, "row slot dim"], Bool[Tensor, "row slot"]]:
+        """Features in float32 of each set of RGB frames by view, and which slots are valid."""
+        rows = [self._preparer.prepare(instruction, views) for views in frames]
+        batches = [self._model(rows[at : at + _ROWS]) for at in range(0, len(rows), _ROWS)]
+        features, valid = zip(*batches, strict=True)
+        return torch.cat(features).cpu(), torch.cat(valid).cpu()
+
+
+def prove(checkpoint: PolicyCheckpoint, features: LiveFeatures, say: Callable[[str], None]) -> None:
+    """Compute the checkpoint's golden rows, one pass a row as a robot asks for it, and compare.
+
+    Raises `CheckpointMismatch` beyond the tolerance; it names slots, deviations, both prompts where
+    they differ, and the entries of the feature spec that differ. `say` gets the largest deviation
+    of a number, relative to the root mean square of its slot, or a warning where the checkpoint has
+    no golden rows.
+    """
+    if not checkpoint.golden:
+        say(
+            "WARNING: this checkpoint carries no golden rows, so that nothing proves that the live "
+            "model gives the features it was trained on: only the feature specs were compared. "
+            "Extract the store anew (stages.extract keeps golden rows) and train the head on it."
+        )
+        return
+    spec = checkpoint.source["feature_spec"]
+    slots, tolerance, largest = spec["slots"], tolerance_of(spec), (-1.0, 0)
+    refused: list[str] = []
+    prompts: list[str] = []
+    for row in checkpoint.golden:
+        live, valid = features([row.frames], row.instruction)
+        deviation = slot_deviations(row.features, live[0].numpy())
+        relative = deviation.relative
+        largest = max(largest, (float(relative.max()), deviation.worst))
+        other = np.flatnonzero(valid[0].numpy() != row.slot_valid).tolist()
+        if wrong := list(dict.fromkeys([*other, *deviation.beyond(tolerance)])):
+            shown = [
+                f"{slot_name(slots[slot])} "
+                + ("is missing in one of both" if slot in other else f"{relative[slot]:.1e}")
+                for slot in wrong[:_SHOWN]
+            ]
+            more = f" and {len(wrong) - _SHOWN} more" if len(wrong) > _SHOWN else ""
+            refused.append(f"  {row.instruction!r}: {', '.join(shown)}{more}")
+        prompt = features.prompt(row.instruction, list(row.frames))
+        if prompt != row.prompt:
+            prompts = [f"prompt, trained: {row.prompt!r}", f"prompt, live:    {prompt!r}"]
+    if refused or prompts:
+        differing = [
+            f"feature spec, {line} (trained -> live)"
+            for line in live_differences(spec, features.spec.document)
+        ] or [
+            "The feature specs agree in every entry: so the weights in memory, the code that "
+            "prepares frames, the attention backend or a library is not what it was at extraction."
+        ]
+        lines = [
+            f"{len(refused)} of {len(checkpoint.golden)} golden rows are not the features that the "
+            "policy was trained on: computed again by the live model, slots deviate by more than "
+            f"{tolerance:.0e} of their root mean square",
+            *refused,
+            *prompts,
+            *differing,
+            f"Compare with {command('verify', '--checkpoint')} on the machine that trained the "
+            "head, or extract the store and train the head with the software of this one.",
+        ]
+        raise CheckpointMismatch("\n".join(lines))
+    say(
+        f"{len(checkpoint.golden)} golden rows computed again: the largest deviation is "
+        f"{largest[0]:.1e} of a slot's root mean square ({slot_name(slots[largest[1]])}), "
+        f"{tolerance:.0e} is tolerated"
+    )

@@ -1,0 +1,147 @@
+"""How a run on a robot went: timings, missed ticks, actions, and why it ended. Numpy only."""
+
+import math
+import time
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.base.table import Table
+from pipeline.robot.loop import StopKind
+
+TickPart = Literal["late", "observe", "check", "plan", "frames", "ask", "act", "record"]
+"""late: from the deadline to the beginning of the tick; the others in the order of a tick."""
+TICK_PARTS: tuple[TickPart, ...] = get_args(TickPart)
+ANSWER_PARTS = ("answer", "infer_ms", "vlm_ms", "head_ms", "wait_ms")
+"""answer: from the question to its answer; the others come from the answer's `server_timing`."""
+KEPT = 65536
+"""Newest ticks whose timings and actions a report keeps."""
+PERCENTILES = {"p50": 50.0, "p99": 99.0, "p99.9": 99.9}
+
+
+class Ring:
+    """The newest `rows` rows (row, column) of float64, in a buffer that is never reallocated."""
+
+    def __init__(self, rows: int, columns: int) -> None:
+        self._buffer = np.full((rows, columns), np.nan)
+        self.count = 0
+        """Rows that were ever added."""
+
+    def note(self, row: Sequence[float] | NDArray[np.float64]) -> None:
+        """Add a row, in place of the oldest where the buffer is full."""
+        self._buffer[self.count % len(self._buffer)] = row
+        self.count += 1
+
+    def rows(self) -> NDArray[np.float64]:
+        """A copy of the rows, oldest first."""
+        free = max(0, len(self._buffer) - self.count)
+        return np.roll(self._buffer, -self.count, axis=0)[free:]
+
+
+class Timings(Ring):
+    """Milliseconds of parts, a row a tick or an answer; NaN where a part did not happen."""
+
+    def __init__(self, parts: Sequence[str], rows: int) -> None:
+        self.parts = tuple(parts)
+        super().__init__(rows, len(self.parts))
+
+    def document(self) -> dict[str, dict[str, float]]:
+        """By part over the kept rows: how often it happened, percentiles and maximum in ms."""
+        parts: dict[str, dict[str, float]] = {}
+        for part, column in zip(self.parts, self.rows().T, strict=True):
+            if len(values := column[~np.isnan(column)]):
+                at = np.percentile(values, list(PERCENTILES.values())).tolist()
+                percentiles = dict(zip(PERCENTILES, at, strict=True))
+                parts[part] = {"count": len(values), **percentiles, "max": float(values.max())}
+        return parts
+
+    def table(self, caption: str = "") -> Table:
+        """The rows of `document`."""
+        heads = ("part", "times", *(f"{name} [ms]" for name in (*PERCENTILES, "max")))
+        rows: list[tuple[Any, ...]] = [(part, *d.values()) for part, d in self.document().items()]
+        return Table(heads, rows, caption)
+
+
+class TickTimer:
+    """The seconds that each part of one tick takes."""
+
+    def begin(self, deadline: float) -> None:
+        """A new tick, late from its deadline on."""
+        self.seconds: dict[TickPart, float] = {}
+        self.part: TickPart = "late"
+        self._since = deadline
+
+    def mark(self, part: TickPart) -> None:
+        """End the part before, and begin `part`."""
+        now = time.monotonic()
+        self.seconds[self.part] = self.seconds.get(self.part, 0.0) + now - self._since
+        self.part, self._since = part, now
+
+    def end(self) -> float:
+        """End the tick; when that was, s."""
+        self.mark("late")
+        return self._since
+
+    def row_ms(self) -> list[float]:
+        """The ms of each of `TICK_PARTS`, NaN of a part that did not happen, and of the tick."""
+        parts = [1000 * self.seconds.get(part, math.nan) for part in TICK_PARTS]
+        return [*parts, float(np.nansum(parts[1:]))]
+
+
+@dataclass(frozen=True)
+class MissedTick:
+    """A tick that ended after the deadline of the next one."""
+
+    tick: int
+    late_ms: float
+    """After that deadline."""
+    part: str
+    """The part that took the most time."""
+    left_out: int
+    """Ticks after it that were not run."""
+
+
+class RunReport:
+    """How a run went and why it ended; timings and actions are of the newest `KEPT` ticks."""
+
+    def __init__(self, hz: float, action_dim: int) -> None:
+        self.hz = hz
+        self.kind, self.reason = StopKind.LOOP, "the process ends"
+        self.tick_timings = Timings((*TICK_PARTS, "tick"), KEPT)
+        self.answer_timings = Timings(ANSWER_PARTS, KEPT)
+        self.missed = deque[MissedTick](maxlen=KEPT)
+        self.sent = Ring(KEPT, 2 + action_dim)
+        """Of each tick with an action: its number, the robot's time, and the action."""
+        self.ticks = self.left_out = self.missed_ticks = 0
+        """Ticks that were run; that were not, because one before took too long; that were late."""
+        self.busy = 0
+        """Questions that the policy's server was too busy to answer; it took their readings."""
+        self.dropped_readings = 0
+        """Readings that came between two questions and are older than a policy's window holds."""
+        self.clipped = 0
+        """Ticks in which limits let less through than was wanted."""
+        self.clock_offset_s = math.nan
+        """The robot's clock less `time.monotonic()`."""
+        self.recording: Path | None = None
+        self.traceback = ""
+        """Of what raised, also in stopping and in recording; empty where all went well."""
+
+    @property
+    def answers(self) -> int:
+        """Answers of the policy."""
+        return self.answer_timings.count
+
+    @property
+    def actions(self) -> NDArray[np.float64]:
+        """(tick, 2 + action): the tick's number, the robot's time, and the action that was sent."""
+        return self.sent.rows()
+
+    def timings(self) -> dict[str, Any]:
+        """The timings as a recording keeps them."""
+        tick, answer = self.tick_timings, self.answer_timings
+        return {"tick_ms": tick.document(), "answer_ms": answer.document()}

@@ -1,0 +1,453 @@
+"""Items are what the timeline and the store say, whichever door they come through."""
+
+import json
+import pickle
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch.utils.data import ConcatDataset, DataLoader
+
+from pipeline.base.config import Source, SplitParams, TrainHeadParams
+from pipeline.base.errors import ConfigError, RecordingError, StoreIncomplete, StoreMismatch
+from pipeline.base.observation import Observation
+from pipeline.compat.unified import no_normalization
+from pipeline.data import Channels, RecordedAction, open_recordings
+from pipeline.data.timeline import build_timeline
+from pipeline.data.windowed import WindowedRecording
+from pipeline.datasets import (
+    AsyncInsertionMeca500DatasetWithSensor,
+    NewAsyncInsertionDataset,
+    UnifiedVLADataset,
+    async_collate_fn_with_sensor,
+    unified_collate_fn,
+)
+from pipeline.models import QwenVLAUnified
+from pipeline.policy.observation import PolicyShape
+from pipeline.policy.policy import Policy
+from pipeline.store import Batch, FeatureStore
+from pipeline.train.split import split_by_episode
+
+SMALL = TrainHeadParams.model_validate(
+    {
+        "sensor_encoder": {"channels": [16, 16], "layers": 1, "heads": 2, "output_dim": 16},
+        "state_encoder": {"dim": 16, "layers": 1, "heads": 2, "output_dim": 16},
+        "expert": {"dim": 16, "layers": 1, "heads": 2},
+    }
+)
+STREAMS = (
+    "feature_age",
+    "sensor",
+    "sensor_valid",
+    "state",
+    "state_valid",
+    "action",
+    "action_valid",
+)
+
+
+@pytest.fixture(scope="module")
+def live(recordings: Path) -> UnifiedVLADataset:
+    return UnifiedVLADataset(sources(recordings))
+
+
+@pytest.fixture(scope="module")
+def cached(recordings: Path, extracted: FeatureStore) -> UnifiedVLADataset:
+    return UnifiedVLADataset(sources(recordings), store=extracted)
+
+
+@pytest.fixture(scope="module")
+def new(recordings: Path) -> UnifiedVLADataset:
+    return UnifiedVLADataset(recordings / "new", "new")
+
+
+def sources(recordings: Path) -> list[Source]:
+    """The new ones first: the store has them last."""
+    return [Source(name=name, path=str(recordings / name)) for name in ("new", "old")]
+
+
+def same(a: Any, b: Any) -> bool:
+    if isinstance(a, torch.Tensor):
+        return torch.equal(a, b)
+    if isinstance(a, dict):
+        return a.keys() == b.keys() and all(np.array_equal(a[view], b[view]) for view in a)
+    return a == b
+
+
+def equal(a: Any, b: Any) -> bool:
+    """Whether two batches, or two samples, say the same."""
+    a, b = (value if isinstance(value, dict) else vars(value) for value in (a, b))
+    return a.keys() == b.keys() and all(
+        len(a[name]) == len(b[name]) and all(map(same, a[name], b[name]))
+        if isinstance(a[name], list)
+        else same(a[name], b[name])
+        for name in a
+    )
+
+
+class TestItems:
+    def test_an_item_is_what_the_timeline_says(
+        self, recordings: Path, new: UnifiedVLADataset
+    ) -> None:
+        source = Source(name="new", path=str(recordings / "new"))
+        recording = open_recordings([source]).recordings[1]
+        state, sensor = recording.state(), recording.sensor()
+        assert state is not None and sensor is not None
+        line = build_timeline(recording, 10.0, 3, "rotvec", state, sensor)
+        offset = new.episodes[1].ticks.start
+        for tick in (0, 1, 7, len(line.time) - 3):
+            item = new[offset + tick]
+            now = line.time[tick]
+            assert float(item["time"]) == now
+            readings = sensor.values[sensor.time <= now][-65:]
+            assert item["sensor_valid"] == len(readings)
+            assert np.array_equal(item["sensor"][65 - len(readings) :], readings)
+            assert not item["sensor"][: 65 - len(readings)].any()
+            states = state.values[state.time <= now][-100:]
+            assert item["state_valid"] == len(states)
+            assert np.array_equal(item["state"][100 - len(states) :], states)
+            ahead = line.action[tick : tick + 8]
+            assert np.array_equal(item["action"][: len(ahead)], ahead)
+            assert item["action_valid"].sum() == len(ahead)
+            assert item["instruction"] == recording.instruction
+            shown = line.vl_time[line.vl_row[tick]]
+            for view, camera in recording.cameras().items():
+                index = int(np.flatnonzero(camera.time <= shown)[-1])
+                (frame,) = camera.read([index])
+                assert np.array_equal(item["images"][view], frame)
+
+    def test_frames_and_features_come_with_the_same_streams(
+        self, live: UnifiedVLADataset, cached: UnifiedVLADataset
+    ) -> None:
+        assert len(live) == len(cached) == len(live.ticks)
+        items = list(range(0, len(live), 5))
+        a, b = live.__getitems__(items), cached.__getitems__(items)
+        for name in STREAMS:
+            assert torch.equal(getattr(a, name), getattr(b, name)), name
+        assert a.instruction == b.instruction
+        assert a.features.shape == (len(items), 0, 0) and a.key is None and a.images is not None
+        assert b.features.shape[1:] == cached.store.feature_shape and b.images is None
+        rows = b.vl_row.numpy()
+        assert b.key is not None
+        assert np.array_equal(b.key.numpy(), cached.store.array("vl/key")[rows])
+
+    def test_samples_make_the_batch_that_is_read_in_one_go(
+        self, live: UnifiedVLADataset, cached: UnifiedVLADataset
+    ) -> None:
+        for data in (live, cached):
+            items = [0, 1, 2, len(data) - 1, 40]
+            batch = unified_collate_fn(data.__getitems__(items))
+            again = unified_collate_fn([data[item] for item in items])
+            assert isinstance(batch, Batch) and isinstance(batch, Observation)
+            assert equal(batch, again)
+            assert equal(batch, unified_collate_fn(list(batch)))
+            with pytest.raises(IndexError):
+                batch[len(items)]
+
+    def test_a_row_is_decoded_once_for_the_ticks_that_share_it(
+        self, live: UnifiedVLADataset
+    ) -> None:
+        batch = live.__getitems__([0, 1, 2, 3])
+        assert batch.images is not None
+        assert batch.vl_row.tolist() == [0, 0, 0, 1]
+        assert batch.images[0] is batch.images[2]
+        assert batch.images[0] is not batch.images[3]
+
+    def test_a_missing_view_is_absent_and_a_missing_stream_counts_nothing(
+        self, copied: Callable[[str], Path]
+    ) -> None:
+        folder = copied("new")
+        first = sorted((folder / "Red_point").iterdir())[0]
+        for image in (first / "images" / "View2").iterdir():
+            image.unlink()
+        metadata = json.loads((first / "metadata.json").read_text())
+        metadata["camera_views"] = ["View1"]
+        (first / "metadata.json").write_text(json.dumps(metadata))
+        (first / "sensor_data.npz").unlink()
+        data = UnifiedVLADataset(folder)
+        item, other = data[0], data[len(data) - 1]
+        assert "View2" not in item["images"] and "View2" in other["images"]
+        assert item["sensor_valid"] == 0 and other["sensor_valid"] == 65
+        assert not item["sensor"].any() and item["sensor"].shape == (65, 1026)
+
+    def test_views_and_windows_are_as_asked_for(self, recordings: Path) -> None:
+        data = UnifiedVLADataset(
+            recordings / "new", "new", 4, 2, 30, 20, 5.0, views=["View1"], instruction="go"
+        )
+        item = data[10]
+        assert list(item["images"]) == ["View1"] and item["instruction"] == "go"
+        assert item["action"].shape == (4, 7) and item["vl_row"] == 5
+        assert item["sensor"].shape == (30, 1026) and item["state"].shape == (20, 12)
+        assert float(data[1]["time"] - data[0]["time"]) == pytest.approx(0.2)
+
+
+class TestOneActionRotation:
+    def test_old_and_new_have_rotation_vectors_where_both_have_poses(
+        self, live: UnifiedVLADataset
+    ) -> None:
+        assert live.store.streams["action"]["names"][3:6] == ["rx", "ry", "rz"]
+
+    def test_old_without_poses_makes_euler_deltas_of_all(
+        self, copied: Callable[[str], Path], recordings: Path
+    ) -> None:
+        old = copied("old")
+        for states in old.glob("**/robot_states.npz"):
+            states.unlink()
+        data = UnifiedVLADataset([old, recordings / "new"])
+        assert data.store.streams["action"]["names"][3:6] == ["da", "db", "dr"]
+        with pytest.raises(StoreMismatch, match=r"action.*da.*rx|action.*rx.*da"):
+            UnifiedVLADataset([old, recordings / "new"], action_rotation="rotvec")
+
+    def test_real_recordings_of_both_formats(self, shared_data: Path) -> None:
+        root = shared_data / "insertion"
+        data = UnifiedVLADataset([root / "old", root / "new"])
+        assert {one.format for one in data.episodes} == {"old", "new"}
+        batch = unified_collate_fn([data[item] for item in range(0, len(data), 7)])
+        assert batch.images is not None and all(batch.images)
+        assert batch.action.shape[1:] == (8, 7)
+        assert batch.sensor.shape[1:] == (65, 1026)
+        # The old recordings have no robot states: Euler deltas for both.
+        assert data.store.streams["action"]["names"][3:6] == ["da", "db", "dr"]
+
+
+class TestStore:
+    def test_an_alias_takes_the_episodes_of_its_format(
+        self, extracted: FeatureStore, recordings: Path
+    ) -> None:
+        old = AsyncInsertionMeca500DatasetWithSensor(store=extracted)
+        new = NewAsyncInsertionDataset(store=extracted.path)
+        assert {one.format for one in old.episodes} == {"old"}
+        assert {one.format for one in new.episodes} == {"new"}
+        assert len(old) + len(new) == extracted.ticks
+        assert isinstance(new, UnifiedVLADataset)
+        assert async_collate_fn_with_sensor is unified_collate_fn
+        again = NewAsyncInsertionDataset(recordings / "new", store=extracted)
+        assert np.array_equal(again.ticks, new.ticks)
+        assert [one.source for one in again.episodes] == ["new", "new"]
+
+    def test_recordings_that_it_lacks_are_named(
+        self, copied: Callable[[str], Path], extracted: FeatureStore
+    ) -> None:
+        folder = copied("new")
+        episode = sorted((folder / "Red_point").iterdir())[0]
+        episode.rename(episode.with_name("episode_20990101_000000"))
+        with pytest.raises(StoreMismatch, match=r"episode_20990101_000000.*stages\.extract"):
+            UnifiedVLADataset(folder, store=extracted)
+
+    @pytest.mark.parametrize(
+        ("settings", "said"),
+        [
+            ({"vlm_reuse_count": 5}, "vlm_reuse_count: 5 expected, found 3"),
+            ({"action_rotation": "euler_delta"}, '"euler_delta" expected, found "rotvec"'),
+            ({"format": "lerobot"}, "'lerobot', found new, old"),
+        ],
+    )
+    def test_settings_of_other_ticks_are_refused(
+        self, extracted: FeatureStore, settings: dict[str, Any], said: str
+    ) -> None:
+        with pytest.raises(StoreMismatch, match=said):
+            UnifiedVLADataset(store=extracted, **settings)
+
+
+class TestErrors:
+    def test_what_contradicts_itself(self, extracted: FeatureStore, recordings: Path) -> None:
+        with pytest.raises(ConfigError, match="recordings or a store"):
+            UnifiedVLADataset()
+        with pytest.raises(ConfigError, match="views"):
+            UnifiedVLADataset(store=extracted, views=["View1"])
+        with pytest.raises(ConfigError, match="recordings or a store"):
+            UnifiedVLADataset(recordings=[], store=extracted)
+        opened = open_recordings(sources(recordings)).recordings
+        for doubled in ({"data": recordings}, {"instruction": "go"}, {"views": ["View1"]}):
+            with pytest.raises(ConfigError, match="open already"):
+                UnifiedVLADataset(recordings=opened, **doubled)
+        with pytest.raises(ConfigError, match="horizon=0"):
+            UnifiedVLADataset(recordings / "new", horizon=0)
+        wrong: Any = "newest"
+        with pytest.raises(ConfigError, match=r"format: .*old.*'newest'"):
+            UnifiedVLADataset(recordings / "new", wrong)
+        with pytest.raises(ConfigError, match=r"action_rotation: .*rotvec.*'newest'"):
+            UnifiedVLADataset(recordings / "new", action_rotation=wrong)
+
+    def test_two_embodiments_are_refused_naming_both(
+        self, recordings: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        """Of the same channels, but what they mean differs."""
+
+        def other(one: WindowedRecording) -> RecordedAction | None:
+            poses = one.poses()
+            if one.path.name != last or poses is None:
+                return None
+            names = ("dx", "dy", "dz", "rx", "ry", "rz", "gripper")
+            channels = Channels(names, ("mm",) * 3 + ("deg",) * 3 + ("",))
+            values = np.zeros((len(poses.time), 7), np.float32)
+            return RecordedAction(channels, poses.time, values, "absolute", None)
+
+        last = max(path.name for path in (recordings / "new" / "Red_point").iterdir())
+        monkeypatch.setattr(WindowedRecording, "action", other)
+        with pytest.raises(StoreMismatch, match=r"7 delta channels.*7 absolute channels.*Make two"):
+            UnifiedVLADataset(recordings / "new")
+
+    def test_frames_beside_features(
+        self, live: UnifiedVLADataset, cached: UnifiedVLADataset
+    ) -> None:
+        for samples in ([live[0], cached[0]], [cached[0], live[0]]):
+            with pytest.raises(StoreMismatch, match="1 of its 2 samples"):
+                unified_collate_fn(samples)
+
+    def test_what_is_not_there(self, tmp_path: Path, recordings: Path) -> None:
+        with pytest.raises(RecordingError, match="nowhere"):
+            UnifiedVLADataset(tmp_path / "nowhere")
+        with pytest.raises(RecordingError, match="old"):
+            AsyncInsertionMeca500DatasetWithSensor(recordings / "new")
+        with pytest.raises(StoreIncomplete, match=r"nowhere\.zarr"):
+            UnifiedVLADataset(store=tmp_path / "nowhere.zarr")
+
+    def test_every_broken_episode_is_named(self, copied: Callable[[str], Path]) -> None:
+        folder = copied("new")
+        for metadata in folder.glob("**/metadata.json"):
+            metadata.write_text("{")
+        with pytest.raises(
+            RecordingError, match=r"(?s)2 episodes.*_092140/metadata.*_092320/metadata"
+        ):
+            UnifiedVLADataset(folder)
+
+
+class TestSplit:
+    def test_whole_episodes_on_either_side(
+        self, live: UnifiedVLADataset, cached: UnifiedVLADataset
+    ) -> None:
+        train, held_out = live.split(0.3)
+        assert sorted(train.indices + held_out.indices) == list(range(len(live)))
+        sides = [set(live.__getitems__(s.indices).episode.tolist()) for s in (train, held_out)]
+        assert sides[0] and sides[1] and not sides[0] & sides[1]
+        loader = DataLoader(held_out, batch_size=50, collate_fn=unified_collate_fn)
+        assert len(next(iter(loader))) == min(50, len(held_out))
+        both = cached.split(0.3)
+        assert sorted(both[0].indices + both[1].indices) == list(range(len(cached)))
+
+    def test_the_same_with_frames_as_with_features_under_the_names_of_the_store(
+        self, recordings: Path, extracted: FeatureStore
+    ) -> None:
+        named = [
+            Source(name=name, path=str(recordings / folder))
+            for name, folder in (("first", "old"), ("second", "new"))
+        ]
+        live, cached = UnifiedVLADataset(named), UnifiedVLADataset(store=extracted)
+        for val_fraction in (0.0, 0.3, 0.5, 0.8):
+            sides = [[side.indices for side in data.split(val_fraction)] for data in (live, cached)]
+            assert sides[0] == sides[1]
+            trained = split_by_episode(extracted, SplitParams(val=val_fraction, test=0))
+            assert sides[1] == [trained.train.tolist(), trained.val.tolist()]
+
+    def test_nothing_is_written_into_the_store(
+        self, recordings: Path, extracted: FeatureStore
+    ) -> None:
+        for data in (UnifiedVLADataset(recordings / "new"), UnifiedVLADataset(store=extracted)):
+            arrays = {name: data.store.array(name) for name in ("vl/key", "tick/vl_row")}
+            before = {name: array.copy() for name, array in arrays.items()}
+            data.split(0.3)
+            for name, array in arrays.items():
+                assert data.store.array(name) is array
+                np.testing.assert_array_equal(array, before[name])
+
+    def test_one_recording_in_two_places_is_on_one_side(self, recordings: Path) -> None:
+        new = str(recordings / "new")
+        twice = [Source(name="a", path=new), Source(name="b", path=new)]
+        data = UnifiedVLADataset(twice)
+        _, held_out = data.split(0.5)
+        held = set(held_out.indices)
+        half = len(data) // 2
+        assert held and {item + half for item in held if item < half} <= held
+
+
+class TestWorkers:
+    @pytest.mark.parametrize(("start", "workers"), [("fork", 2), ("spawn", 1)])
+    def test_batches_are_those_of_this_process(
+        self, new: UnifiedVLADataset, start: str, workers: int
+    ) -> None:
+        loader = DataLoader(
+            new,
+            batch_sampler=[[0, 1, 5], [70, 40], [3]],
+            num_workers=workers,
+            collate_fn=unified_collate_fn,
+            multiprocessing_context=start,
+        )
+        for batch, items in zip(loader, loader.batch_sampler, strict=True):
+            assert equal(batch, new.__getitems__(items))
+
+    def test_recordings_that_are_open_already_are_the_same_data(
+        self, recordings: Path, extracted: FeatureStore, live, cached
+    ) -> None:
+        opened = open_recordings(sources(recordings)).recordings
+        for ours, theirs in (
+            (UnifiedVLADataset(recordings=opened), live),
+            (UnifiedVLADataset(recordings=opened, store=extracted), cached),
+        ):
+            assert len(ours) == len(theirs) and equal(ours[3], theirs[3])
+            assert equal(pickle.loads(pickle.dumps(ours))[3], theirs[3])
+        one = UnifiedVLADataset(recordings=opened[1:2])
+        assert [each.id for each in one.episodes] == [opened[1].id]
+
+    def test_a_pickle_opens_the_data_again(
+        self, live: UnifiedVLADataset, cached: UnifiedVLADataset
+    ) -> None:
+        for data in (live, cached):
+            sent = pickle.dumps(data)
+            assert len(sent) < 4096
+            assert equal(pickle.loads(sent)[3], data[3])
+        alias = AsyncInsertionMeca500DatasetWithSensor(store=cached.store)
+        again = pickle.loads(pickle.dumps(alias))
+        assert type(again) is type(alias) and np.array_equal(again.ticks, alias.ticks)
+
+    def test_data_sets_concatenate(self, recordings: Path, new: UnifiedVLADataset) -> None:
+        parts = [NewAsyncInsertionDataset(path) for path in sorted(recordings.glob("new/*/*"))]
+        loader = DataLoader(ConcatDataset(parts), batch_size=90, collate_fn=unified_collate_fn)
+        batches = list(loader)
+        expected = new.__getitems__(range(len(new)))
+        action = torch.cat([batch.action for batch in batches])
+        assert torch.equal(action, expected.action)
+
+
+class TestModels:
+    def test_a_policy_takes_a_batch_of_either_kind(
+        self, live: UnifiedVLADataset, cached: UnifiedVLADataset
+    ) -> None:
+        for data in (live, cached):
+            batch = data.__getitems__([0, 50, 120])
+            views = len(cached.store.streams["views"])
+            sizes = (*cached.store.feature_shape, 1026, 12, 7)
+            shape = PolicyShape(*sizes, ("other",) * 7, views=views)
+            if data is live:
+                shape = replace(shape, slots=0, feature_dim=0)
+            loss, _ = Policy(SMALL, shape, no_normalization(shape)).loss(
+                batch, batch.action, batch.action_valid
+            )
+            assert torch.isfinite(loss)
+
+    def test_the_unified_model_says_the_same_of_frames_and_of_features(
+        self, live: UnifiedVLADataset, cached: UnifiedVLADataset, demo_checkpoint: Path
+    ) -> None:
+        torch.manual_seed(0)
+        model = QwenVLAUnified(
+            "regression",
+            vl_model_name=str(demo_checkpoint),
+            image_resize_height=56,
+            image_resize_width=56,
+            views=cached.store.streams["views"],
+            vlm={"dtype": "float32"},
+            **SMALL.model_dump(include={"sensor_encoder", "state_encoder", "expert"}),
+        ).eval()
+        losses = [model(**data.__getitems__([0, 1, 90, 150]).inputs()) for data in (live, cached)]
+        assert losses[0].item() == pytest.approx(losses[1].item(), rel=1e-3)
+
+
+def test_a_batch_moves_with_what_is_not_a_tensor(live: UnifiedVLADataset) -> None:
+    batch = live.__getitems__([0, 9])
+    moved = batch.to("meta")
+    assert moved.sensor.is_meta and moved.tick.is_meta
+    assert moved.images is batch.images and moved.instruction == batch.instruction
