@@ -54,8 +54,8 @@ _ROWS_NEAR, _NEAR_S = 5, 1.5
 _HALF = 0.36
 
 
-class Span(NamedTuple):
-    """From one entry of a clock to a later one, in seconds."""
+class Gap(NamedTuple):
+    """From the last entry before a gap to the first after it, in seconds."""
 
     start_s: float
     stop_s: float
@@ -97,10 +97,10 @@ class Clock:
         return GAP_FACTOR * longest if len(self.time) > 2 and longest > 0 else float("inf")
 
     @cached_property
-    def gaps(self) -> tuple[Span, ...]:
-        """Where it skips, in order: from the last entry before to the first after."""
+    def gaps(self) -> tuple[Gap, ...]:
+        """Where it skips, in order."""
         places = np.flatnonzero(np.diff(self.time) >= self.shortest_gap_s)
-        return tuple(Span(float(self.time[at]), float(self.time[at + 1])) for at in places)
+        return tuple(Gap(float(self.time[at]), float(self.time[at + 1])) for at in places)
 
     @property
     def rate_hz(self) -> float:
@@ -184,7 +184,7 @@ def find_clock_issues(view: EpisodeView) -> Iterator[Issue]:
 
 
 def _describe_gap(
-    view: EpisodeView, clock: Clock, gap: Span, recorded: Sequence[Clock]
+    view: EpisodeView, clock: Clock, gap: Gap, recorded: Sequence[Clock]
 ) -> tuple[str, str]:
     """Kind and message: entries are missing, or the clock was set."""
     if apart := _ends_apart(clock, gap, recorded):
@@ -194,7 +194,7 @@ def _describe_gap(
     return "gap", f"no entry for {gap.length_s:.2f} s, expected one every {clock.step_s:.3g} s"
 
 
-def _ends_apart(clock: Clock, gap: Span, recorded: Sequence[Clock]) -> tuple[float, float] | None:
+def _ends_apart(clock: Clock, gap: Gap, recorded: Sequence[Clock]) -> tuple[float, float] | None:
     """Seconds from its end to the nearest clock without such a gap, and the same less the gap.
 
     None where entries are missing: such a clock ends with the others, a clock that was set does not

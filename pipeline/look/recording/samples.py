@@ -18,7 +18,7 @@ from pipeline.look.page.blocks import Block, Text, TokenRun, Tokens
 from pipeline.look.page.style import INK, draw_frame, panels
 from pipeline.look.recording.cameras import read_frames
 from pipeline.look.recording.episode import BROKEN, Draw, EpisodeView
-from pipeline.look.recording.streams import Group, legend_beside, named_groups, plot_curves
+from pipeline.look.recording.streams import ChannelGroup, legend_beside, named_groups, plot_curves
 from pipeline.vlm.feature_spec import FeatureSpec, feature_spec
 from pipeline.vlm.preparation import Preparer
 from pipeline.vlm.processor import TokenKind
@@ -144,7 +144,11 @@ def batch_table(samples: Sequence[Sample], lengths: Mapping[str, int]) -> Table:
 
 
 def _draw_row(
-    axes: Sequence[Axes], name: str, group: Group, windows: Sequence[NDArray[Any]], length: int
+    axes: Sequence[Axes],
+    name: str,
+    group: ChannelGroup,
+    windows: Sequence[NDArray[Any]],
+    length: int,
 ) -> None:
     """The panels of one group of channels, a sample each, with the same values and colours."""
     ahead = name == "action"

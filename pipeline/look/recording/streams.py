@@ -20,7 +20,7 @@ from pipeline.data.contact import CONTACT_RULE, contact_spans, force_columns
 from pipeline.data.timeline import last_at
 from pipeline.look.page.blocks import Block
 from pipeline.look.page.style import PALETTE, panels
-from pipeline.look.recording.clocks import Clock, Span, usual_step
+from pipeline.look.recording.clocks import Clock, usual_step
 from pipeline.look.recording.episode import Draw, EpisodeView, runs
 
 # A sensor whose channels all repeat for as long is frozen.
@@ -54,7 +54,7 @@ _BITMAP, _COLUMNS = 5000, 1200
 _LEAST_S = 1e-3
 
 
-class Group(NamedTuple):
+class ChannelGroup(NamedTuple):
     """Channels that share a panel: those of one unit, or one quantity over place.
 
     `profile` is the common name of the depths of an A-scan and the like, else ''.
@@ -72,21 +72,21 @@ class Group(NamedTuple):
         return f"{name} [{self.unit}]".strip() if self.unit else name
 
 
-def group_channels(channels: Channels) -> list[Group]:
+def group_channels(channels: Channels) -> list[ChannelGroup]:
     """The channels by unit, in their order; then profiles. Grippers are groups of their own."""
     kinds = list(zip(map(unnumbered, channels.names), channels.units, strict=True))
     counts = Counter(kinds)
-    groups: dict[tuple[str, str, bool], Group] = {}
+    groups: dict[tuple[str, str, bool], ChannelGroup] = {}
     for index, (name, (stem, unit)) in enumerate(zip(channels.names, kinds, strict=True)):
         profile = stem.replace("_#", "") if counts[stem, unit] >= PROFILE_CHANNELS else ""
         key = profile, unit, "gripper" in name.lower()
-        group = groups.setdefault(key, Group(profile, unit, [], []))
+        group = groups.setdefault(key, ChannelGroup(profile, unit, [], []))
         group.indices.append(index)
         group.names.append(name)
     return sorted(groups.values(), key=lambda group: bool(group.profile))
 
 
-def named_groups(streams: Mapping[str, Stream]) -> list[tuple[str, Group]]:
+def named_groups(streams: Mapping[str, Stream]) -> list[tuple[str, ChannelGroup]]:
     """The groups of all these streams, each with its stream's name."""
     return [(name, group) for name in streams for group in group_channels(streams[name].channels)]
 
@@ -108,16 +108,15 @@ def motion_blocks(view: EpisodeView, draw: Draw, params: Params) -> list[Block]:
     return [draw("motion", caption, draw_motion)]
 
 
-def contacts(view: EpisodeView) -> tuple[Span, ...]:
-    """Spans in which the needle touches something, by the force alone; none without a force."""
+def contacts(view: EpisodeView) -> list[tuple[float, float]]:
+    """Start and stop in s of each contact, by the force alone; none without a force."""
     sensor = view.sensor
     columns = [] if sensor is None else force_columns(sensor.channels.names)
     if sensor is None or not columns:
-        return ()
+        return []
     newton = {sensor.channels.units[column] for column in columns} == {"N"}
-    step_s = usual_step(sensor.time)
-    spans = contact_spans(sensor.time, sensor.values[:, columns], newton, step_s)
-    return tuple(Span(*span) for span in spans)
+    force = sensor.values[:, columns]
+    return contact_spans(sensor.time, force, newton, usual_step(sensor.time))
 
 
 def draw_sensor(view: EpisodeView) -> Figure:
@@ -196,7 +195,7 @@ def legend_beside(axis: Axes) -> None:
     axis.legend(fontsize=8, ncols=columns, handlelength=1.6, **place)
 
 
-def _panels(groups: Sequence[Group]) -> tuple[Figure, list[Axes]]:
+def _panels(groups: Sequence[ChannelGroup]) -> tuple[Figure, list[Axes]]:
     heights = [_IMAGE_IN if group.profile else _PANEL_IN for group in groups]
     shape = {"squeeze": False, "sharex": True, "height_ratios": heights}
     figure, axes = panels(_WIDTH_IN, sum(heights) + 0.5, len(groups), **shape)
@@ -205,7 +204,12 @@ def _panels(groups: Sequence[Group]) -> tuple[Figure, list[Axes]]:
 
 
 def _draw_curves(
-    axis: Axes, stream: Stream, group: Group, zero: float, held: bool = False, changes: bool = False
+    axis: Axes,
+    stream: Stream,
+    group: ChannelGroup,
+    zero: float,
+    held: bool = False,
+    changes: bool = False,
 ) -> None:
     """Curves that break at gaps of the clock; with `changes`, those that move little as changes."""
     values = stream.values[:, group.indices].astype(np.float64)
@@ -219,7 +223,7 @@ def _draw_curves(
     axis.set_ylabel(unit)
 
 
-def _draw_profile(axis: Axes, stream: Stream, group: Group, zero: float) -> None:
+def _draw_profile(axis: Axes, stream: Stream, group: ChannelGroup, zero: float) -> None:
     """A channel of the profile a line, the first on top, in colours that ignore a few extremes.
 
     A column shows the last reading before it, and nothing at a gap of the clock.

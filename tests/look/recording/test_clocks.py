@@ -6,11 +6,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.look.recording.clocks import Clock, Span, read_clocks, usual_step
+from pipeline.look.recording.clocks import Clock, Gap, read_clocks, usual_step
 from pipeline.look.recording.episode import EpisodeView
 
 
-def gaps(time: np.ndarray) -> tuple[Span, ...]:
+def gaps(time: np.ndarray) -> tuple[Gap, ...]:
     return Clock("sensor", "stream", time).gaps
 
 
