@@ -64,10 +64,6 @@ def _sparse(path: Path) -> None:
     os.truncate(path, 2**40)
 
 
-def _append(text: bytes) -> Act:
-    return lambda path: rewrite(path, path.read_bytes() + text)
-
-
 def _zeros(gigabytes: int, rows: int) -> Act:
     """An npz of one member that says it has that many rows, and unpacks to that many zeros."""
 
@@ -220,7 +216,6 @@ _MAPPED = _set(auto_map={"AutoConfig": "evil.Evil", "AutoModel": "evil.Evil"})
 _HUGE = {"shape": [2 * 10**9], "names": None}
 _LOOPS = "{% for a in range(99999) %}{% for b in range(99999) %}x{% endfor %}{% endfor %}"
 _SPLIT = {"type": "Split", "pattern": {"Regex": "(a+)+$"}, "behavior": "Isolated", "invert": False}
-_TAG = f'!!python/object/apply:os.system ["touch {CANARY}"]\n'.encode()
 _PLAYLIST = "#EXTM3U\n#EXT-X-TARGETDURATION:9\n#EXTINF:9,\n{}\n#EXT-X-ENDLIST\n"
 _CONCAT = "ffconcat version 1.0\nfile {}\n"
 _INFO, _CONFIG, _TOKENS = "meta/info.json", "config.json", "tokenizer_config.json"
@@ -303,8 +298,6 @@ HOSTILE: list[tuple[str, str, str, Act]] = [
     ("store", "vl/time/zarr.json", "a transformer", _set(storage_transformers=[{"name": "evil"}])),
     ("archive", "archive.zarr/zarr.json", "the manifest names a path outside", _edit(_manifest)),
     ("archive", "vl/features/zarr.json", "10**12 rows", _rows(10**12)),
-    ("params", "params.yaml", "a tag", _append(b"zz: " + _TAG)),
-    ("params", "params.yaml", "a merge of a tag", _append(b"<<: " + _TAG)),
     *(
         (subject, name, "a terabyte", _sparse)
         for subject, names in {
@@ -315,7 +308,6 @@ HOSTILE: list[tuple[str, str, str, Act]] = [
             "store": "c/*",
             "archive": "c/*",
             "head": "*.safetensors policy.json",
-            "params": "params.yaml",
         }.items()
         for name in names.split()
     ),
