@@ -7,16 +7,13 @@ of its own kind of error; nothing behind it asks a dictionary.
 
 import gc
 import re
-import signal
 import stat
-import threading
 from collections.abc import Generator, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from reprlib import Repr
-from types import FrameType
 from typing import Annotated, Any, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
@@ -146,28 +143,6 @@ class Border:
             said = getattr(error, "strerror", None) or f"{type(error).__name__}: {raised}"
             why = re.sub(r"<class '(\w+)'>", r"\1", f"{what}: {' '.join(str(said).split()):.300}")
             raise self.refusal(where, why.encode("utf-8", "backslashreplace").decode()) from error
-
-    @contextmanager
-    def time_limit(self, where: Path | str, seconds: float = 10.0) -> Generator[None]:
-        """Refuse where what stands inside takes longer: templates and patterns can loop for ever.
-
-        Holds in the main thread, which is where a command reads what it is given; elsewhere there
-        is no limit.
-        """
-        if threading.current_thread() is not threading.main_thread():
-            yield
-            return
-
-        def ring(number: int, frame: FrameType | None) -> None:
-            raise self.refusal(where, f"was not done after {seconds:g} s")
-
-        before = signal.signal(signal.SIGALRM, ring)
-        signal.setitimer(signal.ITIMER_REAL, seconds)
-        try:
-            yield
-        finally:
-            signal.setitimer(signal.ITIMER_REAL, 0)
-            signal.signal(signal.SIGALRM, before)
 
 
 @contextmanager

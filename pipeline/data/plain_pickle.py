@@ -74,7 +74,7 @@ _CALLS: dict[str, Callable[..., Any]] = {
     "numpy._core.multiarray.scalar": _scalar,
     "numpy._core.numeric._frombuffer": _frombuffer,
     "_codecs.encode": _latin1,
-    "collections.OrderedDict": lambda: {},
+    "collections.OrderedDict": dict,
     "builtins.set": set,
     "builtins.frozenset": frozenset,
     "builtins.bytes": lambda: b"",

@@ -211,8 +211,6 @@ PICKLES = {
 }
 _MAPPED = _set(auto_map={"AutoConfig": "evil.Evil", "AutoModel": "evil.Evil"})
 _HUGE = {"shape": [2 * 10**9], "names": None}
-_LOOPS = "{% for a in range(99999) %}{% for b in range(99999) %}x{% endfor %}{% endfor %}"
-_SPLIT = {"type": "Split", "pattern": {"Regex": "(a+)+$"}, "behavior": "Isolated", "invert": False}
 _PLAYLIST = "#EXTM3U\n#EXT-X-TARGETDURATION:9\n#EXTINF:9,\n{}\n#EXT-X-ENDLIST\n"
 _CONCAT = "ffconcat version 1.0\nfile {}\n"
 _INFO, _CONFIG, _TOKENS = "meta/info.json", "config.json", "tokenizer_config.json"
@@ -254,12 +252,8 @@ HOSTILE: list[tuple[str, str, str, Act]] = [
     *((name, "*.npz", "10**12 rows", _zeros(0, 10**12)) for name in ("raw", "new")),
     ("vlm", _CONFIG, "code of its own", _MAPPED),
     ("vlm", _TOKENS, "code of its own", _MAPPED),
-    ("vlm", _CONFIG, "a vision depth of 10**6", _set("vision_config", depth=10**6)),
-    ("vlm", _CONFIG, "10**6 layers", _set("text_config", num_hidden_layers=10**6)),
-    ("vlm", _CONFIG, "a width of 10**9", _set("text_config", hidden_size=10**9)),
     ("vlm", _PIXELS, "10**12 pixels", _set(min_pixels=10**12, max_pixels=10**13)),
     ("vlm", _PIXELS, "patches of 0", _set(patch_size=0)),
-    ("vlm", _TOKENS, "a chat template without end", _set(chat_template=_LOOPS)),
     (
         "vlm",
         _TOKENS,
@@ -267,14 +261,17 @@ HOSTILE: list[tuple[str, str, str, Act]] = [
         _set(chat_template="{{ ''.__class__.mro() }}"),
     ),
     ("vlm", _TOKENS, "a template that raises", _set(chat_template="{{ raise_exception('no') }}")),
-    ("vlm", "tokenizer.json", "a pattern that backtracks", _set("pre_tokenizer", **_SPLIT)),
     ("vlm", _WEIGHTS, "weights outside, by ..", _weights("../elsewhere.safetensors")),
     ("vlm", _WEIGHTS, "weights outside, by an absolute path", _weights("{}/elsewhere.safetensors")),
     ("vlm", _WEIGHTS, "weights in a pickle", _weights("pytorch_model.bin")),
     ("adapter", _LORA, "code of its own", _MAPPED),
-    ("adapter", _LORA, "modules that backtrack", _set(target_modules="(.*.*.*.*.*)*_nothing")),
-    ("adapter", _LORA, "a rank of 10**9", _set(r=10**9)),
-    ("adapter", _LORA, "10**6 layers", _set(layers_to_transform=list(range(10**6)))),
+    (
+        "adapter",
+        _LORA,
+        "a module to import",
+        _set(megatron_config={"a": 1}, megatron_core="antigravity"),
+    ),
+    ("adapter", _LORA, "adapters of the hub", _set(peft_type="XLORA", adapters={"a": "b/c"})),
     ("adapter", _LORA, "a runtime", _set(runtime_config={"ephemeral_gpu_offload": "yes"})),
     ("store", "vl/features/zarr.json", "10**12 rows", _rows(10**12)),
     ("store", "sensor/values/zarr.json", "10**12 readings", _rows(10**12)),
@@ -301,7 +298,7 @@ HOSTILE: list[tuple[str, str, str, Act]] = [
             "raw": "*.npz *.csv *.jpg",
             "new": "metadata.json",
             "lerobot_v30": "*.parquet",
-            "vlm": "*.safetensors tokenizer.json",
+            "vlm": "*.safetensors",
             "store": "c/*",
             "archive": "c/*",
             "head": "*.safetensors policy.json",
