@@ -29,8 +29,8 @@ ViewName = Annotated[str, Field(max_length=200), AfterValidator(_view_name)]
 _Small = Annotated[int, Field(ge=0, le=2**20)]
 
 
-class Slot(Document):
-    """One pooled vector of a VL row."""
+class SlotDocument(Document):
+    """One pooled vector of a VL row, as `pipeline.vlm.slots.Slot.document` writes it."""
 
     layer: _Small
     norm: bool
@@ -45,7 +45,7 @@ class Spec(Document):
 
     digest: Text
     views: list[ViewName]
-    slots: list[Slot]
+    slots: list[SlotDocument]
     dim: _Small | None = None
     variants: Annotated[int, Field(ge=1, le=1000)] = 1
 
@@ -69,6 +69,8 @@ class ActionChannels(Channels):
     kind: Literal["absolute", "velocity", "delta"]
 
 
+CLOCK_SLACK_S = 1e-6
+"""A reading that is older than a window by less still counts as in it: clocks are rounded."""
 RATE_TOLERANCE = 0.1
 """Rates that differ by no more than this share of themselves are one."""
 

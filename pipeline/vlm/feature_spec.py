@@ -12,9 +12,6 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from pipeline.base import golden
 from pipeline.base.config import VLMParams
 from pipeline.base.differences import describe, differences
@@ -67,6 +64,10 @@ class FeatureSpec:
     def attrs(self) -> dict[str, Any]:
         """The document with its digest, as a store keeps it."""
         return {"digest": self.digest, **self.document}
+
+    def row_key(self, prompt: str, frames: golden.Frames) -> bytes:
+        """16 bytes that differ for every other spec, rendered prompt or decoded frames."""
+        return golden.row_key(self.digest, self.views, prompt, frames)
 
 
 def feature_spec(
@@ -161,14 +162,6 @@ def _read_digest(
             "views": views,
         }
     )
-
-
-def row_key(spec: FeatureSpec, prompt: str, frames: Mapping[str, NDArray[np.uint8]]) -> bytes:
-    """16 bytes that tell this row from any other: spec, rendered prompt, decoded frames by view.
-
-    `frames` are (height, width, 3) RGB as decoded, before any resize; a missing view is left out.
-    """
-    return golden.row_key(spec.digest, spec.views, prompt, frames)
 
 
 def live_differences(trained: Mapping[str, Any], live: Mapping[str, Any]) -> list[str]:

@@ -12,11 +12,11 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from pipeline.base.clock import CLOCK_SLACK_S
 from pipeline.base.config import Params, VLMParams
 from pipeline.base.digests import ContentDigests, ledger_path
 from pipeline.base.errors import PipelineError, RecordingError
 from pipeline.base.ownership import LEDGER_SUFFIX as LEDGER
+from pipeline.base.source import CLOCK_SLACK_S
 from pipeline.base.table import Table
 from pipeline.look.page.blocks import Block, Document, Text, TokenRun, Tokens
 from pipeline.look.page.style import INK, draw_frame, panels

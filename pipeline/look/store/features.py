@@ -15,9 +15,8 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from pipeline.base.bfloat16 import widen
+from pipeline.base.arrays import non_finite, widen
 from pipeline.base.channels import named
-from pipeline.base.finite import non_finite
 from pipeline.base.issue import Issue
 from pipeline.look.page.blocks import Block, Picture, Text
 from pipeline.look.page.style import GRID, PALETTE, draw_map, panels

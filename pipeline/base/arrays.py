@@ -1,9 +1,33 @@
-"""Where numbers are no numbers: the one check for NaN and infinity, of numpy arrays."""
+"""What numpy lacks: bfloat16, held as its bits in uint16, and the first value that is no number.
 
-from typing import Any
+numpy and zarr do not know bfloat16. Its bits are the upper half of a float32's.
+"""
+
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+_EXPONENTS = {"uint16": np.uint16(0x7F80), "float16": np.uint16(0x7C00)}
+"""The bits that are all set in a NaN or infinity, and in no number; numpy is slow with float16."""
+
+
+def widen(values: NDArray[Any]) -> NDArray[Any]:
+    """The numbers: uint16 bits become float32, other types stay as they are."""
+    if values.dtype != np.uint16:
+        return values
+    return (values.astype(np.uint32) << 16).view(np.float32)
+
+
+def array_of(tensor: "Tensor") -> NDArray[Any]:
+    """The tensor, on the CPU, as a store holds it: bfloat16 becomes its bits as uint16."""
+    import torch
+
+    bits = tensor.view(torch.uint16) if tensor.dtype == torch.bfloat16 else tensor
+    return bits.cpu().numpy()
 
 
 def first_non_finite(
@@ -20,10 +44,6 @@ def first_non_finite(
     if not bad.any():
         return None
     return tuple(int(index) for index in np.unravel_index(int(bad.argmax()), bad.shape))
-
-
-_EXPONENTS = {"uint16": np.uint16(0x7F80), "float16": np.uint16(0x7C00)}
-"""The bits that are all set in a NaN or infinity, and in no number; numpy is slow with float16."""
 
 
 def non_finite(values: NDArray[Any]) -> NDArray[np.bool_]:
