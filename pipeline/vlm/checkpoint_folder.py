@@ -166,7 +166,9 @@ def read_config(folder: Path) -> Any:
     path = folder / "config.json"
     what = "cannot be read as the config of a Qwen2.5-VL"
     with quiet_transformers(), VLMS.foreign(path, what):
-        config: Any = Qwen2_5_VLConfig.from_pretrained(folder, local_files_only=True)
+        config: Any = Qwen2_5_VLConfig.from_pretrained(
+            folder, local_files_only=True, trust_remote_code=False
+        )
         text, vision = config.text_config, config.vision_config
         head = text.hidden_size // text.num_attention_heads
         sections = text.rope_parameters["mrope_section"]
