@@ -23,7 +23,7 @@ def widen(values: NDArray[Any]) -> NDArray[Any]:
 
 
 def array_of(tensor: "Tensor") -> NDArray[Any]:
-    """The tensor, on the CPU, as a store holds it: bfloat16 becomes its bits as uint16."""
+    """The tensor as a store holds it, on the CPU: bfloat16 becomes its bits as uint16."""
     import torch
 
     bits = tensor.view(torch.uint16) if tensor.dtype == torch.bfloat16 else tensor
@@ -35,8 +35,8 @@ def first_non_finite(
 ) -> tuple[int, ...] | None:
     """The index of the first NaN or infinity, in C order; None where there is none.
 
-    `valid` has the shape of the leading axes of `values`: what is not valid is not looked at. A
-    uint16 array is read as the bits of bfloat16.
+    `valid` has the shape of the leading axes of `values`; other entries are ignored. A uint16 array
+    is read as the bits of bfloat16.
     """
     bad = non_finite(values)
     if valid is not None:

@@ -5,7 +5,6 @@ scalars, bytes and sets are written with are known, and each stands for a functi
 that checks its arguments. Any other name is refused before it is looked up.
 """
 
-import io
 import pickle
 import re
 from collections.abc import Callable
@@ -114,11 +113,10 @@ def load_plain(path: Path, most: int) -> Any:
     which nothing is executed, or how it is damaged, or that the file has more than `most` bytes.
     """
     check_limit(path, RECORDINGS.check_file(path), most, "array_bytes", "bytes")
-    data = RECORDINGS.read_bytes(path, most)
     # Damaged bytes make numpy and the unpickler raise almost any exception.
-    with RECORDINGS.foreign(path, "damaged pickle"):
+    with RECORDINGS.foreign(path, "damaged pickle"), path.open("rb") as file:
         try:
-            return _plain(_Unpickler(io.BytesIO(data), encoding="latin1").load())
+            return _plain(_Unpickler(file, encoding="latin1").load())
         except _Refused as error:
             raise INTACT.refusal(
                 path,

@@ -26,11 +26,11 @@ _SET = Border(
     "--set 'section.key=\"a text\"'.",
 )
 _REPLACED = {
-    "train_head.val_fraction": "is no longer a key, for episodes are split three ways. Write "
+    "train_head.val_fraction": "is no longer a key, because episodes are split three ways. Write "
     "train_head.split={val: 0.15, test: 0.15}: val chooses the checkpoint and stops early, test is "
     "what stages.evaluate reports on"
 }
-"""Keys of earlier versions, and what takes their place."""
+"""Keys of earlier versions, and their replacements."""
 
 
 def load_params(path: Path, overrides: Sequence[str] = ()) -> Params:
@@ -54,7 +54,7 @@ def load_section(path: Path, section: type[_Section]) -> _Section:
 
 
 def setting(key: str, value: Path | Sequence[str]) -> str:
-    """`--set key=value` for advice: typed into a shell as it is printed, it gives this value."""
+    """`--set key=value` for advice: pasted into a shell, it gives this value."""
     texts = [str(value)] if isinstance(value, Path) else list(value)
     text = yaml.safe_dump(
         texts, default_flow_style=True, allow_unicode=True, width=float("inf")
@@ -132,7 +132,7 @@ def _as_section(document: dict[str, Any], section: type[_Section], where: str) -
 
 
 def _unknown_key(place: Sequence[str], root: type[BaseModel]) -> str:
-    """The key that was likely meant, else all that may stand there."""
+    """The key that was likely meant, or else all keys of the section."""
     section: Any = root
     for part in place[:-1]:
         if part in section.model_fields:
@@ -144,7 +144,7 @@ def _unknown_key(place: Sequence[str], root: type[BaseModel]) -> str:
 
 
 def _section_in(annotation: Any) -> Any:
-    """The section that a field holds, or that its tuple does."""
+    """The section that a field or its tuple holds."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return annotation
     return _section_in(next(part for part in get_args(annotation) if part is not Ellipsis))
