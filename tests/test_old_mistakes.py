@@ -33,7 +33,7 @@ from pipeline.train.batches import Windows
 from pipeline.train.run import policy_shape
 from pipeline.train.split import split_by_episode
 from pipeline.train.statistics import fit_normalization
-from pipeline.vlm.feature_spec import FeatureSpec, feature_spec, row_key
+from pipeline.vlm.feature_spec import FeatureSpec, feature_spec
 from pipeline.vlm.pooling import batch_weights, pool
 from pipeline.vlm.preparation import TokenLayout
 from pipeline.vlm.slots import Slot
@@ -241,7 +241,7 @@ class TestMistake5:
         before, after = rng.integers(0, 255, (2, 8, 8, 3), np.uint8)
 
         assert len({old_key(spec, "go", {"View1": frame}) for frame in (before, after)}) == 1
-        assert len({row_key(spec, "go", {"View1": frame}) for frame in (before, after)}) == 2
+        assert len({spec.row_key("go", {"View1": frame}) for frame in (before, after)}) == 2
 
     @pytest.mark.parametrize(
         "changed",
@@ -263,7 +263,7 @@ class TestMistake5:
     ) -> None:
         copy = Path(shutil.copytree(demo_checkpoint, tmp_path / "checkpoint"))
         before = spec_of(checkpoint=str(copy))
-        assert row_key(before, "go", FRAME) == row_key(spec_of(), "go", FRAME)  # wherever it lies
+        assert before.row_key("go", FRAME) == spec_of().row_key("go", FRAME)  # wherever it lies
         (weights,) = copy.glob("*.safetensors")
         content = bytearray(weights.read_bytes())
         content[-1] ^= 1
@@ -274,7 +274,7 @@ class TestMistake5:
 def check_other_keys(before: FeatureSpec, after: FeatureSpec) -> None:
     assert old_key(before, "go", FRAME) == old_key(after, "go", FRAME)  # the old way
     assert before.digest != after.digest
-    assert row_key(before, "go", FRAME) != row_key(after, "go", FRAME)
+    assert before.row_key("go", FRAME) != after.row_key("go", FRAME)
 
 
 @pytest.fixture

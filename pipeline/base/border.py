@@ -1,22 +1,19 @@
-"""Where something from outside comes in: read once, bounded, and refused in one voice.
+"""The border to files from outside: each is read once, within bounds, and refused in one form.
 
-A document becomes a pydantic model here, and whatever is wrong with it one error that names the
-file, the place in it, what was expected, what was found and what mends it. Each room has a `Border`
-of its own kind of error; nothing behind it asks a dictionary.
+A document becomes a pydantic model. Whatever is wrong with it becomes one error that names the
+file, the place, the expected and the actual value, and the remedy. Each room has a `Border` with
+its own kind of error; behind it no code asks a dictionary.
 """
 
 import gc
 import re
-import signal
 import stat
-import threading
 from collections.abc import Generator, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from reprlib import Repr
-from types import FrameType
 from typing import Annotated, Any, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
@@ -26,13 +23,13 @@ from pipeline.base.errors import PipelineError
 T = TypeVar("T")
 
 MOST_BYTES = 32 * 2**20
-"""Of one document; a tokenizer's is the largest that is usual, with 11 MB."""
+"""Of one document; the largest usual one is a tokenizer's, with 11 MB."""
 Text = Annotated[str, Field(max_length=10_000, pattern=r"^[^\x00]*$")]
 """A name, a path or an instruction: bounded, and without NUL, which no file system takes."""
 _WEIGHTS = {b",": 1, b":": 8, b"[": 8, b"{": 8}
 MOST_WEIGHT = 4_000_000
-"""Of a document, by what its parts take: pydantic keeps what it refuses once for each problem, so
-that a model of a dozen fields can hold some 1.5 GB. A tokenizer's weighs 3 million."""
+"""Bound on a document's values (1 each), keys and lists (8 each): pydantic keeps a refused value
+once for each problem, so a model of a dozen fields can hold 1.5 GB. A tokenizer weighs 3e6."""
 _WORDS = {
     "Extra inputs are not permitted": "unknown key",
     "Field required": "missing",
@@ -44,13 +41,13 @@ _WORDS = {
     "String should": "expected a text to",
     "Invalid JSON": "cannot be read as JSON",
 }
-"""How a problem is told here, by pydantic's words."""
+"""Our words for pydantic's."""
 _MOST_TOLD = 5
 """Problems that one message lists."""
 
 
 class Document(BaseModel):
-    """Base of what others write: no type is guessed, keys that are not known are left alone."""
+    """Base of documents that others write: types are strict, unknown keys are ignored."""
 
     model_config = ConfigDict(frozen=True, strict=True, extra="ignore", allow_inf_nan=False)
 
@@ -70,7 +67,7 @@ class Border:
     def check_file(self, path: Path, most: int | None = None) -> int:
         """The bytes of a regular file; refuses a folder, a pipe, a device, one of more than `most`.
 
-        Only what is regular may be opened: a pipe would be waited for, a device has no end.
+        Opening a pipe would wait for its writer, and a device has no end.
         """
         with self.foreign(path, "cannot be read"):
             try:
@@ -98,7 +95,7 @@ class Border:
     def parse_json(
         self, text: bytes | str, model: type[T], where: Path | str, most: int = MOST_WEIGHT
     ) -> T:
-        """The JSON document of a text of at most that weight, as `read_json`."""
+        """The JSON document of a text of at most that weight, as the model."""
         raw = text.encode("utf-8", "surrogatepass") if isinstance(text, str) else text
         weight = sum(much * raw.count(mark) for mark, much in _WEIGHTS.items())
         if weight > most:
@@ -108,11 +105,11 @@ class Border:
             with uncollected():
                 return _adapter(model).validate_json(raw)
         except ValidationError as error:
-            raise self.refusal(where, told(error)) from None
+            raise self.refusal(where, _first_problems(error)) from None
 
     def read_json_lines(self, path: Path, model: type[T], most: int = 2**20) -> Iterator[T]:
-        """The documents of a file with one a line, each of at most `most` bytes; empty lines are
-        passed over."""
+        """The documents of a file with one on each line, each of at most `most` bytes; empty lines
+        are skipped."""
         self.check_file(path)
         with self.foreign(path, "cannot be read"), path.open("rb") as file:
             for number, line in enumerate(iter(lambda: file.readline(most + 1), b""), start=1):
@@ -123,15 +120,15 @@ class Border:
                     yield self.parse_json(line, model, where)
 
     def parse(self, value: object, model: type[T], where: Path | str) -> T:
-        """Something that another parser has read, as the model."""
+        """A value that another parser has read, as the model."""
         try:
             return _adapter(model).validate_python(value)
         except ValidationError as error:
-            raise self.refusal(where, told(error)) from None
+            raise self.refusal(where, _first_problems(error)) from None
 
     @contextmanager
     def foreign(self, where: Path | str, what: str) -> Generator[None]:
-        """Refuse with `what` where another library raises inside, whatever its error's class is."""
+        """Turn any error of another library inside into a refusal that begins with `what`."""
         try:
             yield
         except BaseException as error:
@@ -147,32 +144,10 @@ class Border:
             why = re.sub(r"<class '(\w+)'>", r"\1", f"{what}: {' '.join(str(said).split()):.300}")
             raise self.refusal(where, why.encode("utf-8", "backslashreplace").decode()) from error
 
-    @contextmanager
-    def time_limit(self, where: Path | str, seconds: float = 10.0) -> Generator[None]:
-        """Refuse where what stands inside takes longer: templates and patterns can loop for ever.
-
-        Holds in the main thread, which is where a command reads what it is given; elsewhere there
-        is no limit.
-        """
-        if threading.current_thread() is not threading.main_thread():
-            yield
-            return
-
-        def ring(number: int, frame: FrameType | None) -> None:
-            raise self.refusal(where, f"was not done after {seconds:g} s")
-
-        before = signal.signal(signal.SIGALRM, ring)
-        signal.setitimer(signal.ITIMER_REAL, seconds)
-        try:
-            yield
-        finally:
-            signal.setitimer(signal.ITIMER_REAL, 0)
-            signal.signal(signal.SIGALRM, before)
-
 
 @contextmanager
 def uncollected() -> Generator[None]:
-    """Keep garbage collection from what is parsed: it would walk over it for most of the time."""
+    """Pause garbage collection while a document is parsed, for which it takes most of the time."""
     collects = gc.isenabled()
     gc.disable()
     try:
@@ -182,7 +157,7 @@ def uncollected() -> Generator[None]:
             gc.enable()
 
 
-def told(error: ValidationError) -> str:
+def _first_problems(error: ValidationError) -> str:
     """The first few problems of a model, as one line."""
     lines = [f"{place}: {what}" if place else what for place, what in problems(error)]
     more = f"; and {len(lines) - _MOST_TOLD} more" if len(lines) > _MOST_TOLD else ""
@@ -192,18 +167,18 @@ def told(error: ValidationError) -> str:
 def problems(error: ValidationError) -> Iterator[tuple[str, str]]:
     """The place of each problem, as in `a.b.0`, and what was expected and found there."""
     for problem in error.errors(include_url=False, include_context=False):
-        said = problem["msg"].removeprefix("Value error, ")
+        text = problem["msg"].removeprefix("Value error, ")
         for theirs, ours in _WORDS.items():
-            said = said.replace(theirs, ours)
+            text = text.replace(theirs, ours)
         if problem["type"] in ("model_type", "model_attributes_type", "dataclass_type"):
-            said = "expected an object"
+            text = "expected an object"
         if problem["type"] == "json_invalid":
             pass
         elif not isinstance(problem["input"], dict):
-            said += f", found {shown(problem['input'])}"
+            text += f", found {shown(problem['input'])}"
         elif problem["type"] not in ("missing", "extra_forbidden", "value_error"):
-            said += ", found keys with values"  # which would bury it
-        yield named(".".join(map(str, problem["loc"]))), said
+            text += ", found keys with values"  # which would bury it
+        yield named(".".join(map(str, problem["loc"]))), text
 
 
 _SHORT = Repr()
@@ -211,12 +186,12 @@ _SHORT.maxlevel, _SHORT.maxstring, _SHORT.maxother = 3, 120, 120
 
 
 def shown(value: object) -> str:
-    """A value as a message shows it: short, and in characters that every terminal can write."""
+    """A value for a message: short, and in characters that every terminal can print."""
     return _SHORT.repr(value).encode("utf-8", "backslashreplace").decode()
 
 
 def named(text: str) -> str:
-    """A name, a path or a place as a message shows it: as it is, unless that cannot be printed."""
+    """A name, a path or a place for a message: as it is if it can be printed."""
     return text if len(text) <= 1000 and text.isprintable() else shown(text)
 
 

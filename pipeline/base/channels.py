@@ -1,4 +1,4 @@
-"""Channels by name: which are alike, and which of these hardly move."""
+"""Channels by name and unit: which are alike, and which of those hardly move."""
 
 import re
 from collections import defaultdict
@@ -8,11 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 PROFILE_CHANNELS = 24
-"""Channels of one unit that a number alone tells apart, from which they are one profile."""
+"""From so many channels on that differ in a number alone, they form one profile."""
 STILL = 0.01
-"""Times what is usual for channels alike, below which a standard deviation is that of noise."""
+"""A standard deviation below this share of the usual one is noise."""
 _ALIKE = 3
-"""Moving channels alike, from which what is usual for them is known."""
+"""So many moving channels make a usual spread."""
 _SHOWN = 4
 _GROUP_BY_UNIT = dict.fromkeys(("m", "cm", "mm"), "translation") | {
     "deg": "rotation",
@@ -30,9 +30,9 @@ def named(names: Sequence[str], columns: Sequence[int]) -> str:
     places = np.asarray(columns, np.int64)
     groups = np.split(places, np.flatnonzero(np.diff(places) > 1) + 1)
     ends = [(names[int(group[0])], names[int(group[-1])]) for group in groups]
-    said = [first if first == last else f"{first}–{last}" for first, last in ends]
-    more = f" and {len(said) - _SHOWN} more" if len(said) > _SHOWN + 1 else ""
-    return ", ".join(said[:_SHOWN] if more else said) + more
+    runs = [first if first == last else f"{first}–{last}" for first, last in ends]
+    more = f" and {len(runs) - _SHOWN} more" if len(runs) > _SHOWN + 1 else ""
+    return ", ".join(runs[:_SHOWN] if more else runs) + more
 
 
 def action_groups(names: Sequence[str], units: Sequence[str]) -> tuple[str, ...]:
@@ -49,9 +49,9 @@ def action_groups(names: Sequence[str], units: Sequence[str]) -> tuple[str, ...]
 def hardly_moving(
     std: NDArray[np.floating], names: Sequence[str], units: Sequence[str]
 ) -> dict[int, float]:
-    """Channels that vary, but far less than those alike; each with what is usual for these.
+    """Channels that vary, but far less than similar ones; with the usual spread of those.
 
-    `std` is (channel,), 0 where one does not vary.
+    `std` is (channel,), 0 where a channel does not vary.
     """
     usual = usual_spread(std, names, units)
     return {
@@ -64,11 +64,11 @@ def hardly_moving(
 def usual_spread(
     std: NDArray[np.floating], names: Sequence[str], units: Sequence[str]
 ) -> NDArray[np.float64]:
-    """What is usual for the channels that are like each, (channel,); 0 where too few are.
+    """The usual spread of the channels similar to each, (channel,); 0 where too few are.
 
-    `std` is (channel,), 0 where one does not vary. Alike are channels of one unit and, but for its
-    numbers, one name, such as joints; usual is the upper quartile of those that vary, which still
-    channels beside moving ones do not lower.
+    `std` is (channel,), 0 where a channel does not vary. Similar channels have one unit and, but
+    for numbers, one name, such as joints. The usual spread is the upper quartile over those that
+    vary, which still channels do not lower.
     """
     kinds: dict[tuple[str, str], list[int]] = defaultdict(list)
     for column, kind in enumerate(zip(map(unnumbered, names), units, strict=True)):

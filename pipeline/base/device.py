@@ -1,6 +1,6 @@
-"""Which device does the tensor maths, and in which precision.
+"""The device of tensors, and its precision.
 
-torch takes over a second to import: a command that finds nothing to do must not pay for it.
+Importing torch takes over a second, which a command that has nothing to do must not spend.
 """
 
 from typing import TYPE_CHECKING, Literal
@@ -38,8 +38,8 @@ def resolve_device(name: str) -> "torch.device":
 def use_bfloat16(amp: Literal["auto", "off", "bfloat16"], device: "torch.device") -> bool:
     """Whether the forward pass runs under bfloat16 autocast.
 
-    `auto` is yes on a CUDA device with bfloat16 arithmetic and no elsewhere, where autocast
-    seldom pays and float32 keeps a run reproducible to the bit.
+    `auto` means yes on a CUDA device with bfloat16 arithmetic. Elsewhere autocast seldom pays, and
+    float32 keeps a run reproducible to the bit.
     """
     import torch
 

@@ -1,19 +1,19 @@
-"""Where two JSON documents differ: the one comparison of specs, sources and checkpoints."""
+"""The places where two JSON documents differ, for specs, sources and checkpoints."""
 
 import json
 from collections.abc import Mapping
 from typing import Any
 
 Differences = dict[str, tuple[Any, Any]]
-"""Dotted place -> (expected, what is there); None where absent."""
+"""Dotted place -> (expected, actual); None where absent."""
 
 
 def differences(expected: Any, actual: Any, place: str = "") -> Differences:
     """The places of two JSON documents that differ, in the order of the first.
 
-    Two mappings with equal `digest` are equal; of two with different ones the entries that differ
-    are named, and the digest only where they all agree. Of two lists of mappings of one length the
-    entries are compared, other lists are compared as a whole.
+    Two mappings with equal `digest` are equal. If their digests differ, the entries that differ are
+    named, and the digest only where all entries agree. Two lists of mappings of equal length are
+    compared entry by entry, other lists as a whole.
     """
     if isinstance(expected, Mapping) and isinstance(actual, Mapping):
         if "digest" in expected and expected["digest"] == actual.get("digest"):

@@ -1,21 +1,21 @@
-"""What can go wrong, named.
+"""The errors that a user can mend.
 
-Every `PipelineError` is something the user can mend: a stage prints it without a traceback and
-exits with 2. Its message says what was expected, what was found, where, and what to run next.
-Each child is also the builtin that a caller would have caught without knowing this package.
+A stage prints a `PipelineError` without a traceback and exits with 2. The message says the
+expected and the actual value, the place, and what to run next. Each child is also the builtin
+error that a caller would catch without knowing this package.
 """
 
 
 class PipelineError(Exception):
-    """Base of everything the user can mend."""
+    """Base of all errors that the user can mend."""
 
 
 class ConfigError(PipelineError, ValueError):
-    """A value of params.yaml or of `--set` is not what it must be."""
+    """A value of params.yaml or of `--set` is wrong."""
 
 
 class ObservationError(PipelineError, ValueError):
-    """What a policy is given to look at is not what it takes."""
+    """An observation does not fit the policy."""
 
 
 class RecordingError(PipelineError, ValueError):
@@ -27,7 +27,7 @@ class VLMError(PipelineError, ValueError):
 
 
 class StoreMismatch(PipelineError, ValueError):
-    """A store holds something else than what was asked of it."""
+    """A store does not hold what a command needs."""
 
 
 class StoreIncomplete(PipelineError, RuntimeError):
@@ -39,7 +39,7 @@ class StoreLocked(PipelineError, RuntimeError):
 
 
 class DiskFull(PipelineError, OSError):
-    """Too little space for what has to be written."""
+    """The disk has too little space."""
 
 
 class TooManyMaps(PipelineError, OSError):
@@ -59,7 +59,7 @@ class CheckpointIncomplete(PipelineError, RuntimeError):
 
 
 class WireError(PipelineError, ValueError):
-    """A message between robot and server is not what it must be."""
+    """A message between robot and server is malformed."""
 
 
 class ServerError(PipelineError, ConnectionError):
@@ -67,4 +67,4 @@ class ServerError(PipelineError, ConnectionError):
 
 
 class ServerBusy(ServerError):
-    """A policy server has more observations waiting than it takes; the connection stays."""
+    """A policy server has too many observations waiting; the connection stays."""

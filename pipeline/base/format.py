@@ -7,11 +7,11 @@ from typing import Any
 import yaml
 
 MOST_LINES = 20
-"""Of one kind that are shown; the rest is counted."""
+"""Lines of one kind that are shown; the rest is counted."""
 
 
 def size(count: float) -> str:
-    """Bytes in the largest binary unit of which there is a whole one: `512 B`, `1.5 GiB`."""
+    """Bytes in the largest binary unit that fits at least once: `512 B`, `1.5 GiB`."""
     for unit, factor in (("TiB", 2**40), ("GiB", 2**30), ("MiB", 2**20)):
         if count >= factor:
             return f"{count / factor:.1f} {unit}"
@@ -19,7 +19,7 @@ def size(count: float) -> str:
 
 
 def duration(seconds: float) -> str:
-    """Seconds to three digits, minutes from two of them on, hours from two of those."""
+    """Seconds to three digits; minutes from two minutes on, hours from two hours on."""
     if seconds < 120:
         return f"{seconds:.3g} s"
     minutes = seconds / 60
@@ -27,13 +27,13 @@ def duration(seconds: float) -> str:
 
 
 def capped(lines: Sequence[str], kind: str, most: int = MOST_LINES) -> list[str]:
-    """The first lines, and how many more there are."""
+    """The first lines, and a line with the number of the others."""
     more = len(lines) - most
     return [*lines[:most], *([f"and {more} more {kind}"] if more > 0 else [])]
 
 
 def as_yaml(document: Mapping[str, Any]) -> str:
-    """A nested document as YAML in its own order; what holds nothing nested stands in one line."""
+    """A nested document as YAML in its own order; flat lists and objects take one line."""
     plain = json.loads(json.dumps(document, default=str))
     return yaml.safe_dump(
         plain, sort_keys=False, default_flow_style=None, width=float("inf"), allow_unicode=True

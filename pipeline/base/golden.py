@@ -1,6 +1,6 @@
 """Golden rows: a few rows whose decoded frames are kept beside their features.
 
-Whoever is to use these features can compute them again, on another machine and without a recording.
+So the features can be computed again, on another machine and without a recording.
 """
 
 import hashlib
@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 MOST_GOLDEN = 4
-"""Rows of a store that are kept so."""
+"""Golden rows of a store, at most."""
 
 Frames = Mapping[str, NDArray[np.uint8]]
 """By view: (height, width, 3) RGB as decoded, before any resize; a missing view is left out."""
@@ -19,13 +19,13 @@ Frames = Mapping[str, NDArray[np.uint8]]
 
 @dataclass(frozen=True, eq=False)
 class GoldenRow:
-    """A VL row with all that its features follow from, and the features as they are stored."""
+    """A VL row with all inputs of its features, and the features as they are stored."""
 
     key: bytes
     """`row_key` of its feature spec, prompt and frames."""
     instruction: str
     prompt: str
-    """As it was rendered."""
+    """The rendered prompt."""
     frames: Frames
     features: NDArray[np.float32]
     """(slot, dim) of the plain frames."""
@@ -34,7 +34,7 @@ class GoldenRow:
 
 
 def row_key(spec_digest: str, views: Sequence[str], prompt: str, frames: Frames) -> bytes:
-    """16 bytes that tell this row from any other: spec, rendered prompt, frames in view order."""
+    """16 bytes that differ for every other spec, rendered prompt or frames in view order."""
     digest = hashlib.blake2b(digest_size=16)
     for text in (spec_digest, prompt):
         _add(digest, text.encode())
@@ -49,7 +49,7 @@ def row_key(spec_digest: str, views: Sequence[str], prompt: str, frames: Frames)
 def spread(rows: NDArray[np.int64], views: NDArray[np.int64]) -> NDArray[np.int64]:
     """At most `MOST_GOLDEN` of these rows, evenly spread over those that have the most views.
 
-    `views` (row,) counts those of each.
+    `views` (row,) is the number of views of each.
     """
     full = rows[views == views.max(initial=0)]
     places = np.linspace(0, max(0, len(full) - 1), min(MOST_GOLDEN, len(full)))
@@ -57,6 +57,6 @@ def spread(rows: NDArray[np.int64], views: NDArray[np.int64]) -> NDArray[np.int6
 
 
 def _add(digest: "hashlib.blake2b", part: bytes) -> None:
-    # Lengths in between: moving a character from one part to the next is another key.
+    # The length comes first: a character that moves to the next part gives another key.
     digest.update(len(part).to_bytes(8, "little"))
     digest.update(part)

@@ -1,23 +1,22 @@
-"""Something that looks wrong, and where: what every check of the project gives."""
+"""The result of a check: something that looks wrong, and where."""
 
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
 Severity = Literal["error", "warning", "note", "ok"]
-"""An error keeps a stage from using what has it; a note could be better; `ok` was looked at."""
+"""error: a stage cannot use it. note: it could be better. ok: it was checked."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Issue:
-    """One thing that was looked at and how it is; times are float64 seconds on the clock of what
-    was looked at."""
+    """One checked thing and its state; times are float64 seconds on its own clock."""
 
     severity: Severity
     kind: str
     """As docs/looking.md explains it: `gap`, `dead camera`, …"""
     message: str
-    """One line: what was expected, and what is there."""
+    """One line with the expected and the actual value."""
     source: str = ""
     episode: str = ""
     stream: str = ""

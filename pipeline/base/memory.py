@@ -1,4 +1,4 @@
-"""Memory of this process: the machine's, or less where a container or a job is limited.
+"""The memory of this process: the machine's, or the limit of its container or job.
 
 Limits are those of the control groups (version 2) that the process is in, and of their parents.
 """
@@ -10,7 +10,7 @@ _ROOT = Path("/")
 
 
 _FILE_PAGES = ("inactive_file", "active_file")
-"""Lines of memory.stat: pages of files, which are counted as used and can be dropped."""
+"""Lines of memory.stat: pages of files, which count as used and can be dropped."""
 
 
 def memory_bytes(root: Path = _ROOT) -> int:
@@ -19,7 +19,7 @@ def memory_bytes(root: Path = _ROOT) -> int:
 
 
 def available_bytes(root: Path = _ROOT) -> int:
-    """Memory that can be had without swapping; file pages that can be dropped count as free.
+    """Free memory without swapping; file pages that can be dropped count as free.
 
     `root` holds proc and sys.
     """
@@ -31,7 +31,7 @@ def _limits(root: Path) -> Iterator[tuple[int, int]]:
     """Limit and use, in bytes, of each limited control group from the process's own upwards."""
     top = root / "sys/fs/cgroup"
     own = top / _read(root / "proc/self/cgroup").rpartition("::/")[2]
-    # In a container the place may be that outside of it: then only the first group is seen.
+    # In a container the path may be the host's: then only the first group is visible.
     for group in (own, *own.parents):
         limit, used = _read(group / "memory.max"), _read(group / "memory.current")
         if limit.isdigit() and used.isdigit():

@@ -1,4 +1,4 @@
-"""What a policy sees: what stores gather and policies look at."""
+"""The input of a policy, which stores gather and robots measure."""
 
 from dataclasses import dataclass
 
@@ -8,7 +8,7 @@ from torch import Tensor
 
 @dataclass
 class Observation:
-    """What a policy sees at `batch` ticks, in physical units.
+    """The input of a policy at `batch` ticks, in physical units.
 
     Streams come in their stored dtype, right-aligned: windows end at their tick and are zero on the
     left where the episode had not begun; `*_valid` counts the real readings. A stream that is
@@ -18,9 +18,9 @@ class Observation:
     features: Float[Tensor, "batch slot dim"]
     slot_valid: Bool[Tensor, "batch slot"]
     feature_age: Float[Tensor, " batch"]
-    """Seconds since the newest frame that the features have seen."""
+    """Seconds since the newest frame of the features."""
     view_age: Float[Tensor, "batch view"]
-    """Seconds since the frame of each view that the features have seen; NaN of a missing view."""
+    """Seconds since the features' frame of each view; NaN of a missing view."""
     sensor: Float[Tensor, "batch sensor_window channel"]
     sensor_valid: Int[Tensor, " batch"]
     sensor_age: Float[Tensor, "batch sensor_window"]

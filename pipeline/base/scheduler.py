@@ -1,6 +1,6 @@
-"""dask schedulers: one for the processes of a single command, or the one at a user's address.
+"""dask schedulers: a private one for a single command, or the one at a user's address.
 
-Whoever reaches a dask scheduler can have its workers run any code, as the user who started them.
+Whoever reaches a dask scheduler can run any code on its workers, as the user who started them.
 """
 
 import logging
@@ -61,9 +61,9 @@ def client_of(address: str, setting: str) -> Client:
 
 @contextmanager
 def quiet() -> Generator[None]:
-    """Keep dask's log off stderr: what matters of it is raised, or said by us.
+    """Keep dask's log off stderr: its errors are raised, or printed by us.
 
-    That of asyncio, too: dask leaves the failures of processes that never came up to it.
+    asyncio's log too: dask reports there that a process failed to start.
     """
     loggers: list[Any] = [logging.getLogger(name) for name in ("distributed", "tornado", "asyncio")]
     levels = [logger.level for logger in loggers]

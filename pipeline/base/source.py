@@ -1,4 +1,4 @@
-"""What a store and a policy trained from it say alike: features, streams, clocks."""
+"""Documents that a store and a policy share: feature spec, streams, clocks."""
 
 import re
 from typing import Annotated, Literal, Self
@@ -9,7 +9,7 @@ from pipeline.base.border import Document, Text
 
 
 def is_view_name(name: str) -> bool:
-    """Whether it can be a folder's name too, beside zarr's own: it neither climbs nor enters one.
+    """Whether it can name a folder beside zarr's own files, without leading into another.
 
     zarr takes a backslash for a slash.
     """
@@ -25,12 +25,12 @@ def _view_name(name: str) -> str:
 
 
 ViewName = Annotated[str, Field(max_length=200), AfterValidator(_view_name)]
-"""What a view can be called, in a recording as in a store."""
+"""A view's name, in a recording and in a store."""
 _Small = Annotated[int, Field(ge=0, le=2**20)]
 
 
-class Slot(Document):
-    """One pooled vector of a VL row."""
+class SlotDocument(Document):
+    """One pooled vector of a VL row, as `pipeline.vlm.slots.Slot.document` writes it."""
 
     layer: _Small
     norm: bool
@@ -41,17 +41,17 @@ class Slot(Document):
 
 
 class Spec(Document):
-    """The feature spec, as far as it is used beyond being compared."""
+    """The entries of a feature spec that are used for more than comparison."""
 
     digest: Text
     views: list[ViewName]
-    slots: list[Slot]
+    slots: list[SlotDocument]
     dim: _Small | None = None
     variants: Annotated[int, Field(ge=1, le=1000)] = 1
 
 
 class Channels(Document):
-    """What the channels of a stream are called, and their units; none where a store lacks it."""
+    """Names and units of a stream's channels; empty where a store lacks the stream."""
 
     names: list[Text]
     units: list[Text]
@@ -64,13 +64,15 @@ class Channels(Document):
 
 
 class ActionChannels(Channels):
-    """Those of the action, and what a number of it means."""
+    """The action's channels, and the meaning of its numbers."""
 
     kind: Literal["absolute", "velocity", "delta"]
 
 
+CLOCK_SLACK_S = 1e-6
+"""A reading that is older than a window by less still counts as in it: clocks are rounded."""
 RATE_TOLERANCE = 0.1
-"""Rates that differ by no more than this share of themselves are one."""
+"""Rates count as equal if they differ by no more than this share."""
 
 
 class Streams(Document):
@@ -83,7 +85,7 @@ class Streams(Document):
 
 
 class SourceDocument(Document):
-    """What a policy keeps of the store that it was trained from."""
+    """The entries that a policy keeps of its store."""
 
     feature_spec: Spec
     streams: Streams

@@ -1,4 +1,4 @@
-"""Rows under column heads, and how they read as text, CSV, Markdown and in a page."""
+"""Tables, as text, CSV, Markdown and in a page."""
 
 import csv
 import io
@@ -12,7 +12,7 @@ from typing import Any
 from pipeline.base.durable import disk_full_named, fresh
 
 NOTHING = "–"
-"""What stands where there is no value."""
+"""Stands for a missing value."""
 DIGITS = 4
 """Significant digits of a number that is no count."""
 PLAIN = (1e-4, 1e7)
@@ -30,7 +30,7 @@ class Column:
 
 @dataclass(frozen=True)
 class Table:
-    """Rows of cells under column heads; numbers stand right, in as many digits as they deserve.
+    """Rows of cells under column heads; numbers stand right, in four significant digits.
 
     A cell is a word, a number, a bool or None.
     """
@@ -39,11 +39,11 @@ class Table:
     rows: Sequence[Sequence[Any]]
     caption: str = ""
     strong: frozenset[int] = field(default_factory=frozenset[int])
-    """Rows that stand out in a page."""
+    """Rows that a page emphasises."""
 
     @classmethod
     def of(cls, rows: Iterable[Mapping[str, Any]]) -> "Table":
-        """Of rows that say the same heads each, one of them at least."""
+        """The table of one row or more, each with the same heads."""
         rows = list(rows)
         return cls(list(rows[0]), [list(row.values()) for row in rows])
 
@@ -108,9 +108,11 @@ def number(value: float) -> str:
 
 
 def _column(head: str, values: Sequence[Any]) -> Column:
-    given = [value for value in values if value is not None]
-    numeric = bool(given) and all(isinstance(v, numbers.Real) and not _is_bool(v) for v in given)
-    whole = numeric and all(math.isnan(value) or float(value).is_integer() for value in given)
+    present = [value for value in values if value is not None]
+    numeric = bool(present) and all(
+        isinstance(v, numbers.Real) and not _is_bool(v) for v in present
+    )
+    whole = numeric and all(math.isnan(value) or float(value).is_integer() for value in present)
     cells = [int(v) if whole and v is not None and not math.isnan(v) else v for v in values]
     return Column(head, numeric, tuple(map(_word, cells)))
 

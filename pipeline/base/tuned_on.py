@@ -1,4 +1,4 @@
-"""Which episodes a model was tuned on: beside its weights, and in the stores of its features."""
+"""The episodes that a model was tuned on, beside its weights and in stores of its features."""
 
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -11,9 +11,9 @@ from pipeline.base.durable import read_document, write_with_digest
 from pipeline.base.errors import StoreIncomplete
 
 TUNED_ON = "tuned_on.json"
-"""In the folder of an adapter, or of a checkpoint that was tuned whole: no part of its digest."""
+"""The file in the folder of an adapter or of a tuned checkpoint; no part of its digest."""
 _ATTRIBUTE = "tuned_on"
-"""Of a store, where its model says it."""
+"""The attribute of a store whose model has such a file."""
 _STORE = Border(StoreIncomplete, "Copy the store again, or extract it anew with stages.extract.")
 
 Tick = Annotated[int, Field(ge=0, le=10**12)]
@@ -29,7 +29,7 @@ class EpisodePart(Document):
     content: Text
     """Digest of the episode's files."""
     group: Text
-    """Episodes of one group are on one side, but for a single one that is cut by time."""
+    """Episodes of one group are on one side; a single episode may be cut by time."""
 
     @model_validator(mode="after")
     def _has_ticks(self) -> Self:
@@ -39,21 +39,21 @@ class EpisodePart(Document):
 
 
 class TunedPart(EpisodePart):
-    """Those that a model has seen."""
+    """The ticks of one episode that a model has seen."""
 
     episode: Text
     """As "source/id"."""
 
 
 class TunedOn(Document):
-    """What a model was tuned on, and what its best step was chosen on."""
+    """The episodes that a model was tuned on, and those that chose its best step."""
 
     train: Annotated[tuple[TunedPart, ...], Strict(False)] = ()
     val: Annotated[tuple[TunedPart, ...], Strict(False)] = ()
 
     @classmethod
     def of_split(cls, split: Mapping[Side, Mapping[str, EpisodePart]]) -> "TunedOn":
-        """That of a checkpoint's split."""
+        """The train and val sides of a checkpoint's split."""
         parts = {
             side: [{"episode": name, **part.model_dump()} for name, part in split[side].items()]
             for side in SIDES[:2]
@@ -62,7 +62,7 @@ class TunedOn(Document):
 
 
 def joined(several: Iterable[TunedOn | None]) -> TunedOn | None:
-    """What a model was tuned on one after the other; None where nothing is known."""
+    """The episodes of several tunings, one after the other; None where nothing is known."""
     known = [tuned for tuned in several if tuned is not None]
     if not known:
         return None
@@ -73,7 +73,7 @@ def joined(several: Iterable[TunedOn | None]) -> TunedOn | None:
 
 
 def read_tuned_on(folder: Path) -> TunedOn | None:
-    """What the model in this folder was tuned on; None where it does not say.
+    """The episodes that the model in this folder was tuned on; None without such a file.
 
     Raises `CheckpointIncomplete` where the file is damaged.
     """
@@ -82,9 +82,9 @@ def read_tuned_on(folder: Path) -> TunedOn | None:
 
 
 def of_store(attributes: Mapping[str, Any], path: Path) -> TunedOn | None:
-    """What the model of the store at `path` was tuned on; None where it does not say.
+    """The episodes that the model of the store at `path` was tuned on; None if unknown.
 
-    Raises `StoreIncomplete` where the attributes say it otherwise than it was written.
+    Raises `StoreIncomplete` where the attribute is damaged.
     """
     where = f"{path}, attribute {_ATTRIBUTE}"
     document = attributes.get(_ATTRIBUTE)
@@ -92,7 +92,7 @@ def of_store(attributes: Mapping[str, Any], path: Path) -> TunedOn | None:
 
 
 def store_attributes(tuned: TunedOn | None) -> dict[str, Any]:
-    """What a store says of it; nothing where nothing is known, as of every other store."""
+    """The attribute for a store; empty where nothing is known."""
     return {} if tuned is None else {_ATTRIBUTE: tuned.model_dump(mode="json")}
 
 

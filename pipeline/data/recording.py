@@ -21,11 +21,11 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.base.clock import CLOCK_SLACK_S
+from pipeline.base.arrays import first_non_finite, non_finite
 from pipeline.base.config import Source
 from pipeline.base.digests import joint_digest
 from pipeline.base.errors import RecordingError
-from pipeline.base.finite import first_non_finite, non_finite
+from pipeline.base.source import CLOCK_SLACK_S
 from pipeline.data.media import FARTHEST_S, RECORDINGS
 
 _MOST_BYTES = 2**38

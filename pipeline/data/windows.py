@@ -10,8 +10,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.base.arrays import first_non_finite
 from pipeline.base.errors import RecordingError
-from pipeline.base.finite import first_non_finite
 from pipeline.data.arrays import Numbers
 
 _OVERLAP = 0.75

@@ -14,7 +14,7 @@ from sklearn.neighbors import NearestNeighbors
 from sklearn.preprocessing import StandardScaler
 from sklearn.random_projection import SparseRandomProjection
 
-from pipeline.base.bfloat16 import widen
+from pipeline.base.arrays import widen
 from pipeline.policy.normalization import ChannelStatistics
 from pipeline.policy.shape import Kind, channel_kinds
 from pipeline.policy.state_channels import expand

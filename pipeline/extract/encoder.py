@@ -8,7 +8,7 @@ from typing import Any, Literal
 import torch
 from numpy.typing import NDArray
 
-from pipeline.base.bfloat16 import array_of
+from pipeline.base.arrays import array_of
 from pipeline.base.errors import NumericsError, VLMError
 from pipeline.extract.engine import ReadyRow
 from pipeline.vlm.preparation import TokenLayout

@@ -27,7 +27,7 @@ from pipeline.data.row_range import Frames, RowFrames, RowRange, by_episode
 from pipeline.extract.plan import rate_name
 from pipeline.extract.survey import Survey
 from pipeline.store import FEATURES, RowSource, StoreBuild
-from pipeline.vlm.feature_spec import FeatureSpec, row_key
+from pipeline.vlm.feature_spec import FeatureSpec
 from pipeline.vlm.preparation import PreparedRow, Preparer
 
 if TYPE_CHECKING:
@@ -106,7 +106,7 @@ class RowPreparation:
     def _row(
         self, rows: RowRange, row: int, frames: Frames, prompt: str, firsts: dict[bytes, int] | None
     ) -> Row:
-        key = row_key(self._spec, prompt, frames)
+        key = self._spec.row_key(prompt, frames)
         with self._lock:
             for source in self._known:
                 if (taken := source.take(key)) is not None:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from pipeline.base.bfloat16 import widen
+from pipeline.base.arrays import widen
 from pipeline.base.config import Params
 from pipeline.base.differences import describe, differences
 from pipeline.base.digests import ContentDigests, ledger_path

@@ -19,12 +19,11 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from pipeline.base.bfloat16 import widen
+from pipeline.base.arrays import non_finite, widen
 from pipeline.base.channels import named
 from pipeline.base.commands import command
 from pipeline.base.config import InspectParams, setting
 from pipeline.base.errors import StoreIncomplete
-from pipeline.base.finite import non_finite
 from pipeline.base.format import duration, size
 from pipeline.base.issue import Issue, Severity
 from pipeline.base.table import Table

@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import AfterValidator, Field, GetPydanticSchema
 
+from pipeline.base.arrays import first_non_finite
 from pipeline.base.errors import NumericsError
-from pipeline.base.finite import first_non_finite
 
 Block = NDArray[Any] | tuple[NDArray[Any], NDArray[np.bool_]]
 """Rows of values, or such rows and which of their values are valid."""

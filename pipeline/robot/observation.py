@@ -11,9 +11,9 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.base.clock import CLOCK_SLACK_S
+from pipeline.base.arrays import first_non_finite
 from pipeline.base.errors import ObservationError
-from pipeline.base.finite import first_non_finite
+from pipeline.base.source import CLOCK_SLACK_S
 from pipeline.robot.chunking import PlanGuide
 
 LONGEST_PROMPT: Final = 1000

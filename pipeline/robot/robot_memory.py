@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.base.clock import CLOCK_SLACK_S
+from pipeline.base.source import CLOCK_SLACK_S
 
 if TYPE_CHECKING:
     from pipeline.policy.policy import Policy

@@ -23,10 +23,10 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import ConfigDict
 
+from pipeline.base.arrays import non_finite
 from pipeline.base.border import Document, Text
 from pipeline.base.durable import sync, write_document
 from pipeline.base.errors import RecordingError
-from pipeline.base.finite import non_finite
 from pipeline.base.ownership import OutputKind, begin_folder, remove_folder, unmark
 from pipeline.data.lerobot import ACTION, STATE
 from pipeline.data.lerobot_writer import write_sidecar, write_v30

@@ -11,7 +11,7 @@ from pydantic import AliasPath, Field
 
 from pipeline.base.border import Border, Document, Text
 from pipeline.base.errors import StoreIncomplete
-from pipeline.base.source import Slot, SourceDocument, ViewName
+from pipeline.base.source import SlotDocument, SourceDocument, ViewName
 from pipeline.store.repair_hints import mend
 
 Length = Annotated[int, Field(ge=0, le=2**48)]
@@ -81,7 +81,7 @@ class StoreAttributes(SourceDocument):
     """All of them, as they stand there."""
     version: Literal[1] = Field(alias="schema")
     plan: Text
-    slots: list[Slot]
+    slots: list[SlotDocument]
     sources: Annotated[list[Text], Field(min_length=1)]
     environment: list[_Environment]
     golden: list[StoredGolden] = Field(default_factory=list, max_length=16)

@@ -13,8 +13,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from pipeline.base.clock import CLOCK_SLACK_S
 from pipeline.base.memory import available_bytes
+from pipeline.base.source import CLOCK_SLACK_S
 from pipeline.store.batch import Batch
 from pipeline.store.episodes import episode_of
 from pipeline.store.mapping import fitting, populate, read_at_random, will_need

@@ -22,8 +22,8 @@ from tqdm import tqdm
 from zarr.buffer import cpu
 from zarr.storage import MemoryStore
 
+from pipeline.base.arrays import non_finite
 from pipeline.base.errors import StoreIncomplete
-from pipeline.base.finite import non_finite
 from pipeline.base.format import capped, size
 from pipeline.base.issue import Issue
 from pipeline.store.border import StoreAttributes, store_border

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from torch import Generator
 from tqdm import tqdm
 
+from pipeline.base.arrays import first_non_finite
 from pipeline.base.errors import NumericsError
-from pipeline.base.finite import first_non_finite
 from pipeline.policy.policy import Trainable
 from pipeline.store import Batch, FeatureStore, place
 from pipeline.train.batches import BatchIndices, Prefetch, Ticks, Windows, cut_batches

@@ -11,10 +11,9 @@ import torch
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from pipeline.base.bfloat16 import widen
+from pipeline.base.arrays import first_non_finite, widen
 from pipeline.base.channels import usual_spread
 from pipeline.base.errors import NumericsError
-from pipeline.base.finite import first_non_finite
 from pipeline.policy.attention import right_aligned
 from pipeline.policy.normalization import Block, ChannelStatistics, Normalization, fit_channels
 from pipeline.policy.shape import channel_kinds, expanded_names

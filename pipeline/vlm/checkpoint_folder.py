@@ -1,24 +1,24 @@
 """Where a checkpoint or an adapter lies on disk, which of its files decide what it says, and what
-they may say."""
+must never run or leave the folder.
+
+transformers and peft read the documents themselves, after the checks of this module.
+"""
 
 import json
-import re
-from collections.abc import Iterator, Sequence
-from contextlib import suppress
-from itertools import product
+import sys
+from collections.abc import Generator, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, Literal
 
-from pydantic import AliasChoices, Field, JsonValue, Strict, model_validator
+from pydantic import Field, JsonValue
 from safetensors import safe_open
 
-from pipeline.base.border import MOST_BYTES, Border, Document, Text, shown
+from pipeline.base.border import Border, Document
 from pipeline.base.commands import command
 from pipeline.base.config import VLMParams
 from pipeline.base.errors import VLMError
 from pipeline.base.tuned_on import TunedOn, joined, read_tuned_on
-
-T = TypeVar("T")
 
 VLMS = Border(
     VLMError,
@@ -36,9 +36,6 @@ _DTYPES = {"F32", "F16", "BF16"}
 """What safetensors calls the dtypes that weights may have."""
 
 _INDEX = "model.safetensors.index.json"
-
-_LOADED = re.compile(r"config|token|vocab|merges|template|index")
-"""In the names of what transformers reads; a trainer leaves others, of any size."""
 
 _QUANTIZED = "quantization_config"
 _REFUSED = {
@@ -139,101 +136,10 @@ def tuned_on(vlm: VLMParams) -> TunedOn | None:
     return joined(map(read_tuned_on, folders))
 
 
-_List = Annotated[tuple[T, ...], Strict(False)]
-_Triple = Annotated[_List[T], Field(min_length=3, max_length=3)]
-_Count = Annotated[int, Field(ge=1, le=10**6)]
-_Layers = Annotated[int, Field(ge=1, le=512)]
-_Pixels = Annotated[int, Field(ge=1, le=10**9)]
-_Positive = Annotated[int | float, Field(gt=0, le=1e9)]
-_MATCHING_S = 5.0
-QWENS = (
-    r"(?i:'s|'t|'re|'ve|'m|'ll|'d)|[^\r\n\p{L}\p{N}]?\p{L}+|\p{N}| ?[^\s\p{L}\p{N}]+[\r\n]*"
-    r"|\s*[\r\n]+|\s+(?!\S)|\s+"
-)
-"""The pattern by which Qwen2's tokenizers split a text into words."""
-
-
-class _Settings(Document):
-    """Part of config.json."""
-
-    # transformers makes a list of so many.
-    num_labels: Annotated[int, Field(ge=0, le=1000)] | None = None
-
-
-class _Rope(Document):
-    """Rotary positions."""
-
-    mrope_section: _Triple[_Count] = (16, 24, 24)
-
-
-class TextConfig(_Settings):
-    """The decoder; what the released checkpoints say and transformers' default is not must stand
-    there."""
-
-    hidden_size: _Count
-    num_hidden_layers: _Layers
-    num_attention_heads: _Count
-    head_dim: _Count | None = None
-    vocab_size: _Count
-    max_position_embeddings: _Pixels
-    rms_norm_eps: Annotated[float, Field(ge=0, le=1)]
-    rope_scaling: _Rope | None = None
-    rope_parameters: _Rope | None = None
-
-
-class VisionConfig(_Settings):
-    """The vision tower; the defaults are transformers' own, for a file may leave them out."""
-
-    depth: _Layers = 32
-    hidden_size: _Count = 3584
-    num_heads: _Count = 16
-    patch_size: _Count = 14
-    spatial_merge_size: _Count = 2
-    temporal_patch_size: _Count = 2
-    window_size: Annotated[int, Field(ge=28, le=10_000)] = 112
-    fullatt_block_indexes: _List[Annotated[int, Field(ge=0)]] = (7, 15, 23, 31)
-    # transformers takes these for depth and num_heads.
-    num_hidden_layers: None = None
-    num_attention_heads: None = None
-
-
-class VLMConfig(_Settings):
-    """config.json."""
+class _Kind(Document):
+    """config.json, before transformers reads it: another kind of model would be taken for one."""
 
     model_type: Literal["qwen2_5_vl"]
-    text_config: TextConfig
-    vision_config: VisionConfig
-    image_token_id: Annotated[int, Field(ge=0, le=10**6)] = 151655
-
-    @model_validator(mode="before")
-    @classmethod
-    def _nested(cls, given: Any) -> Any:
-        """The hub's configs are flat, those that transformers 5 writes are nested."""
-        if isinstance(given, dict) and given.get("text_config") is None:
-            return given | {"text_config": given}
-        return given
-
-    @model_validator(mode="after")
-    def _agrees(self) -> "VLMConfig":
-        """What would otherwise fail while features are computed, or give others."""
-        text, vision = self.text_config, self.vision_config
-        head, blocks = text.hidden_size // text.num_attention_heads, vision.fullatt_block_indexes
-        sections = (text.rope_scaling or text.rope_parameters or _Rope()).mrope_section
-        silent = {"num_heads", "fullatt_block_indexes"} - vision.model_fields_set
-        for what, fits in {
-            f"mrope_section {sections} to sum to half a head of {head}": 2 * sum(sections) == head,
-            f"head_dim {text.head_dim} to be {head}": text.head_dim in (None, head),
-            f"4 x num_heads {vision.num_heads} to divide vision_config's hidden_size": (
-                vision.hidden_size % (4 * vision.num_heads) == 0
-            ),
-            f"fullatt_block_indexes {blocks} below depth {vision.depth}": (
-                max(blocks, default=0) < vision.depth
-            ),
-            f"{sorted(silent)} in vision_config": not silent or vision.hidden_size == 1280,
-        }.items():
-            if not fits:
-                raise ValueError(f"expected {what}")
-        return self
 
 
 class _WeightIndex(Document):
@@ -241,132 +147,85 @@ class _WeightIndex(Document):
 
 
 class _AdapterConfig(Document):
-    """adapter_config.json; what peft would import, open or go on with for ever is refused."""
+    """adapter_config.json, before peft reads it: other kinds and keys have it import modules, or
+    load models of other folders or of the hub."""
 
-    r: _Count = 8
-    rank_pattern: dict[Text, _Count] = Field(default_factory=dict)
-    alpha_pattern: dict[Text, int | float] = Field(default_factory=dict)
-    bias: Literal["none", "all", "lora_only"] = "none"
-    # So short that `pissa_niter_` has three digits.
-    init_lora_weights: bool | Annotated[str, Field(max_length=15)] | None = True
-    loftq_config: dict[Text, Annotated[int, Field(le=100)]] | None = None
-    layer_replication: None = None
+    peft_type: Literal["LORA"]
     megatron_config: None = None
     arrow_config: None = None
 
 
-class _Edges(Document):
-    shortest_edge: _Pixels = Field(validation_alias=AliasChoices("shortest_edge", "min_pixels"))
-    longest_edge: _Pixels = Field(validation_alias=AliasChoices("longest_edge", "max_pixels"))
+def read_config(folder: Path) -> Any:
+    """The checkpoint's `Qwen2_5_VLConfig`, as transformers reads config.json.
 
-
-class PreprocessorConfig(Document):
-    """preprocessor_config.json of a Qwen2VLImageProcessor; the defaults are that processor's."""
-
-    image_processor_type: Annotated[str, Field(pattern="^Qwen2VLImageProcessor")] | None = None
-    do_resize: Literal[True] = True
-    do_rescale: Literal[True] = True
-    do_normalize: Literal[True] = True
-    resample: Literal[3] = 3
-    patch_size: _Count = 14
-    merge_size: _Count = 2
-    temporal_patch_size: _Count = 2
-    rescale_factor: _Positive = 1 / 255
-    image_mean: _Triple[int | float]
-    image_std: _Triple[_Positive]
-    size: _Edges = _Edges(shortest_edge=56 * 56, longest_edge=28 * 28 * 1280)
-    min_pixels: _Pixels | None = None
-    max_pixels: _Pixels | None = None
-
-
-class _ProcessorConfig(Document):
-    image_processor: PreprocessorConfig | None = None
-
-
-class _BPE(Document):
-    vocab: dict[str, int]
-    merges: list[Any]
-
-
-class _Tokenizer(Document):
-    model: _BPE
-    normalizer: JsonValue = None
-    pre_tokenizer: JsonValue = None
-
-
-_TOKENIZERS = r"^(Qwen2Tokenizer(Fast)?|PreTrainedTokenizerFast|TokenizersBackend)$"
-
-
-class _TokenizerConfig(Document):
-    tokenizer_class: Annotated[str, Field(pattern=_TOKENIZERS)] | None = None
-
-
-class ChatTemplate(Document):
-    """chat_template.json."""
-
-    chat_template: str | None = None
-
-
-def read_preprocessor(folder: Path) -> PreprocessorConfig:
-    """What the image processor does; `VLMError` where its patches are not those of the model."""
-    path, nested = folder / "preprocessor_config.json", folder / "processor_config.json"
-    config = None
-    if nested.exists():  # what transformers 5 writes goes first
-        config = VLMS.read_json(nested, _ProcessorConfig).image_processor
-    config = config or VLMS.read_json(path, PreprocessorConfig)
-    vision = read_config(folder).vision_config
-    ours = (config.patch_size, config.merge_size, config.temporal_patch_size)
-    theirs = (vision.patch_size, vision.spatial_merge_size, vision.temporal_patch_size)
-    if ours != theirs:
-        why = f"expected patch, merge and temporal patch size {theirs} of config.json, found {ours}"
-        raise VLMS.refusal(path, why)
-    return config
-
-
-def check_tokenizer(folder: Path) -> None:
-    """Raise `VLMError` where a tokenizer's file cannot be read, is cut off or another model's."""
-    small_files(folder)
-    tokenizer_files(folder)
-    if (path := folder / "tokenizer_config.json").exists():
-        VLMS.read_json(path, _TokenizerConfig)
-    if (where := folder / "tokenizer.json").exists():
-        tokenizer = VLMS.read_json(where, _Tokenizer)
-        model = tokenizer.model
-        for key, pattern in _entries([tokenizer.normalizer, tokenizer.pre_tokenizer]):
-            if key == "Regex" and pattern != QWENS:  # any other may go on for ever
-                raise VLMS.refusal(where, f"expected Qwen2's pattern, found {shown(pattern)}")
-    else:
-        where, vocab = folder / "merges.txt", VLMS.read_json(folder / "vocab.json", dict[str, int])
-        lines = filter(bytes.strip, VLMS.read_bytes(where).splitlines())
-        merges = [line for line in lines if not line.startswith(b"#version:")]
-        model = _BPE(vocab=vocab, merges=merges)
-    # A merge makes each token of several characters, but for the control tokens.
-    made = sum(len(token) > 1 and token[0] + token[-1] != "<>" for token in model.vocab)
-    if len(model.merges) < made:
-        why = f"cut off: expected {made} merges for its vocabulary, found {len(model.merges)}"
-        raise VLMS.refusal(where, why)
-
-
-def read_config(folder: Path) -> VLMConfig:
-    """The checkpoint's config.json.
-
-    Raises `VLMError` unless it is a Qwen2.5-VL without code of its own and without quantization.
+    Raises `VLMError` as `check_documents`, and where transformers cannot read it or its sizes do
+    not fit each other, which would fail while features are computed.
     """
-    config = VLMS.read_json(folder / "config.json", VLMConfig)
-    _refuse_code(folder, VLMS)
+    from transformers import Qwen2_5_VLConfig  # takes seconds
+
+    check_documents(folder)
+    path = folder / "config.json"
+    what = "cannot be read as the config of a Qwen2.5-VL"
+    with quiet_transformers(), VLMS.foreign(path, what):
+        config: Any = Qwen2_5_VLConfig.from_pretrained(
+            folder, local_files_only=True, trust_remote_code=False
+        )
+        text, vision = config.text_config, config.vision_config
+        head = text.hidden_size // text.num_attention_heads
+        sections = text.rope_parameters["mrope_section"]
+        blocks, heads = vision.fullatt_block_indexes, vision.num_heads
+        merged = vision.patch_size * vision.spatial_merge_size
+        for what, fits in {
+            f"three mrope_section that sum to half a head of {head}, found {sections}": (
+                len(sections) == 3 and 2 * sum(sections) == head
+            ),
+            f"head_dim to be {head}": getattr(text, "head_dim", None) in (None, head),
+            f"4 x num_heads {heads} to divide hidden_size": vision.hidden_size % (4 * heads) == 0,
+            f"fullatt_block_indexes {blocks} below depth {vision.depth}": (
+                max(blocks, default=0) < vision.depth
+            ),
+            f"window_size {vision.window_size} of {merged} or more": vision.window_size >= merged,
+        }.items():
+            if not fits:
+                raise VLMS.refusal(path, f"expected {what}")
     return config
+
+
+def check_documents(folder: Path) -> None:
+    """Raise `VLMError` unless a checkpoint is a Qwen2.5-VL without code of its own, not quantized,
+    and without a document, template or text that is no regular file."""
+    small_files(folder)
+    VLMS.read_json(folder / "config.json", _Kind)
+    _refuse_code(folder, VLMS)
 
 
 def small_files(folder: Path) -> list[Path]:
-    """Every document, template and text of a folder, sorted.
-
-    Raises `VLMError` for what is no file, or one for transformers that is too large.
-    """
+    """Every document, template and text of a folder, sorted; `VLMError` for what is no file."""
     beside = (*folder.glob("*"), *folder.glob("additional_chat_templates/*"))
     files = sorted(path for path in beside if path.suffix in (".json", ".jinja", ".txt"))
     for path in files:
-        VLMS.check_file(path, MOST_BYTES if _LOADED.search(path.name) else None)
+        VLMS.check_file(path)
     return files
+
+
+@contextmanager
+def quiet_transformers() -> Generator[None]:
+    """Keep transformers' reports off stderr, and its progress bars unless that is a terminal.
+
+    What they warn of is checked and raised as `VLMError`.
+    """
+    from transformers.utils import logging
+
+    verbosity, bar = logging.get_verbosity(), logging.is_progress_bar_enabled()
+    logging.set_verbosity_error()
+    if not sys.stderr.isatty():
+        logging.disable_progress_bar()
+    try:
+        yield
+    finally:
+        logging.set_verbosity(verbosity)
+        if bar:
+            logging.enable_progress_bar()
 
 
 def _refuse_code(folder: Path, border: Border) -> None:
@@ -431,7 +290,7 @@ def weight_files(folder: Path) -> list[Path]:
             f"files. Remove {whole.name} if the shards are the checkpoint, else {_INDEX} and the "
             "shards."
         )
-    read_config(folder)
+    check_documents(folder)
     tensor_shapes(files)
     return files
 
@@ -465,21 +324,11 @@ def tokenizer_files(folder: Path) -> list[Path]:
 def adapter_files(folder: Path) -> list[Path]:
     """The files that decide what an adapter adds, sorted.
 
-    Raises `VLMError` where one is missing or damaged, or its weights are no floats.
+    Raises `VLMError` where one is missing or damaged, where it is no LoRA or names code of its own,
+    or its weights are no floats.
     """
     files = [folder / "adapter_config.json", folder / "adapter_model.safetensors"]
-    config = ADAPTERS.read_json(files[0], _AdapterConfig)
+    ADAPTERS.read_json(files[0], _AdapterConfig)
     _refuse_code(folder, ADAPTERS)
-    shapes = tensor_shapes(files, ADAPTERS)
-    widest = max((size for shape in shapes.values() for size in shape), default=0)
-    if (rank := max([config.r, *config.rank_pattern.values()])) > widest:
-        why = f"expected a rank of at most the widest tensor of its weights, {widest}, found {rank}"
-        raise ADAPTERS.refusal(files[0], why)
-    document = ADAPTERS.read_json(files[0], dict[str, JsonValue])
-    texts = (text for entry in _entries(document) for text in entry if isinstance(text, str))
-    where = f"{files[0]}: its patterns cannot be matched with its weights' names"
-    with ADAPTERS.time_limit(where, _MATCHING_S):
-        for pattern, name in product(texts, shapes):
-            with suppress(re.error):  # a text that is no pattern
-                re.match(rf"(.*\.)?({pattern})$", name)
+    tensor_shapes(files, ADAPTERS)
     return files

@@ -21,14 +21,19 @@ from transformers import Qwen2_5_VLConfig, Qwen2_5_VLForConditionalGeneration
 
 from pipeline.base.durable import replace_folder
 from pipeline.base.ownership import OutputKind
-from pipeline.vlm.checkpoint_folder import QWENS
-from pipeline.vlm.loading import quiet_transformers
+from pipeline.vlm.checkpoint_folder import quiet_transformers
 
 _FILES = Path(__file__).with_name("demo")
 """What the checkpoint is made from: its own small files, its architecture, and the words that the
 tokenizer learns its merges from."""
 
 _VOCABULARY = 1536
+
+_WORDS = (
+    r"(?i:'s|'t|'re|'ve|'m|'ll|'d)|[^\r\n\p{L}\p{N}]?\p{L}+|\p{N}| ?[^\s\p{L}\p{N}]+[\r\n]*"
+    r"|\s*[\r\n]+|\s+(?!\S)|\s+"
+)
+"""The pattern by which Qwen2's tokenizers split a text into words."""
 
 
 def write_demo_checkpoint(folder: Path, seed: int = 0) -> None:
@@ -65,7 +70,7 @@ def _train_tokenizer() -> Tokenizer:
     tokenizer.normalizer = normalizers.NFC()
     tokenizer.pre_tokenizer = pre_tokenizers.Sequence(
         [
-            pre_tokenizers.Split(Regex(QWENS), behavior="isolated"),
+            pre_tokenizers.Split(Regex(_WORDS), behavior="isolated"),
             pre_tokenizers.ByteLevel(add_prefix_space=False, use_regex=False),
         ]
     )

@@ -12,9 +12,6 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from pipeline.base import golden
 from pipeline.base.commands import command
 from pipeline.base.config import VLMParams
@@ -69,6 +66,10 @@ class FeatureSpec:
         """The document with its digest, as a store keeps it."""
         return {"digest": self.digest, **self.document}
 
+    def row_key(self, prompt: str, frames: golden.Frames) -> bytes:
+        """16 bytes that differ for every other spec, rendered prompt or decoded frames."""
+        return golden.row_key(self.digest, self.views, prompt, frames)
+
 
 def feature_spec(
     vlm: VLMParams,
@@ -85,9 +86,7 @@ def feature_spec(
     `VLMError` where the checkpoint is incomplete or `vlm.layers` goes past it.
     """
     folder = resolve_checkpoint(vlm.checkpoint, vlm.revision)
-    text = read_config(folder).text_config
     ordered = tuple(sorted(set(views)))
-    slots = slots_of(vlm, text.num_hidden_layers, ordered)
     adapter = resolve_checkpoint(vlm.adapter, setting="vlm.adapter") if vlm.adapter else None
 
     def read() -> str:
@@ -95,7 +94,8 @@ def feature_spec(
 
     what = _read_digest(folder, vlm, len(ordered), digest_file) if remember else ""
     rendered = json.loads(remember(what, read) if remember else read())
-    processor = rendered["processor"]
+    processor, dim = rendered["processor"], rendered["dim"]
+    slots = slots_of(vlm, rendered["layers"], ordered)
     document = {
         "extractor_version": EXTRACTOR_VERSION,
         "weights": _files_digest(weight_files(folder), digest_file),
@@ -107,14 +107,14 @@ def feature_spec(
         "processor": processor,
         "views": list(ordered),
         "slots": slot_documents(slots, vlm.variants),
-        "dim": text.hidden_size,
+        "dim": dim,
         "compute_dtype": vlm.dtype,
         "storage_dtype": storage_dtype,
         **_augmentation(vlm),
     }
     digest = _digest(document)
     image_size = processor["image_size"][0], processor["image_size"][1]
-    return FeatureSpec(document, digest, slots, ordered, text.hidden_size, image_size, vlm.variants)
+    return FeatureSpec(document, digest, slots, ordered, dim, image_size, vlm.variants)
 
 
 def feature_shape(vlm: VLMParams, views: Sequence[str]) -> tuple[int, int]:
@@ -134,11 +134,13 @@ def feature_shape(vlm: VLMParams, views: Sequence[str]) -> tuple[int, int]:
 
 
 def _read(folder: Path, vlm: VLMParams, views: int) -> dict[str, Any]:
-    """The entries of the document that transformers has to read."""
+    """What transformers has to read: entries of the document, and the number of layers."""
     from pipeline.vlm.processor import PixelSettings, PromptRenderer
 
-    renderer = PromptRenderer(folder, vlm.prompt)
+    renderer, text = PromptRenderer(folder, vlm.prompt), read_config(folder).text_config
     return {
+        "layers": text.num_hidden_layers,
+        "dim": text.hidden_size,
         "chat_template": renderer.chat_template,
         "example_prompt": renderer.render(_PLACEHOLDER_INSTRUCTION, views),
         "processor": PixelSettings.of(vlm).document(),
@@ -161,14 +163,6 @@ def _read_digest(
             "views": views,
         }
     )
-
-
-def row_key(spec: FeatureSpec, prompt: str, frames: Mapping[str, NDArray[np.uint8]]) -> bytes:
-    """16 bytes that tell this row from any other: spec, rendered prompt, decoded frames by view.
-
-    `frames` are (height, width, 3) RGB as decoded, before any resize; a missing view is left out.
-    """
-    return golden.row_key(spec.digest, spec.views, prompt, frames)
 
 
 def live_differences(trained: Mapping[str, Any], live: Mapping[str, Any]) -> list[str]:

@@ -1,9 +1,6 @@
 """A checkpoint folder and an optional adapter -> the inner model, every weight accounted for."""
 
-import sys
 import warnings
-from collections.abc import Generator
-from contextlib import contextmanager
 from math import prod
 from pathlib import Path
 from typing import Any
@@ -11,9 +8,8 @@ from typing import Any
 import PIL
 import torch
 import transformers
-from transformers import Qwen2_5_VLConfig, Qwen2_5_VLForConditionalGeneration
+from transformers import Qwen2_5_VLForConditionalGeneration
 from transformers.utils import is_flash_attn_2_available
-from transformers.utils import logging as transformers_logging
 
 from pipeline.base.config import VLMParams
 from pipeline.base.errors import VLMError
@@ -21,6 +17,8 @@ from pipeline.vlm.checkpoint_folder import (
     ADAPTERS,
     VLMS,
     adapter_files,
+    quiet_transformers,
+    read_config,
     resolve_checkpoint,
     tensor_shapes,
     weight_files,
@@ -80,25 +78,6 @@ def environment(model: Any) -> dict[str, str]:
     }
 
 
-@contextmanager
-def quiet_transformers() -> Generator[None]:
-    """Keep transformers' reports off stderr, and its progress bars unless that is a terminal.
-
-    What they warn of is checked and raised as `VLMError`.
-    """
-    verbosity = transformers_logging.get_verbosity()
-    bar = transformers_logging.is_progress_bar_enabled()
-    transformers_logging.set_verbosity_error()
-    if not sys.stderr.isatty():
-        transformers_logging.disable_progress_bar()
-    try:
-        yield
-    finally:
-        transformers_logging.set_verbosity(verbosity)
-        if bar:
-            transformers_logging.enable_progress_bar()
-
-
 def attention_backend(vlm: VLMParams, device: torch.device) -> str:
     """What `vlm.attention` means on this device."""
     if vlm.attention != "auto":
@@ -118,17 +97,8 @@ def load_checkpoint(vlm: VLMParams, device: torch.device, dtype: str | None = No
             "vlm.attention flash_attention_2 needs CUDA and a half-precision vlm.dtype, found "
             f"{device.type} and {vlm.dtype}. Set vlm.attention to auto."
         )
-    what = "cannot be loaded as Qwen2.5-VL"
-    with quiet_transformers(), VLMS.foreign(folder, what), torch.device("meta"):
-        config = Qwen2_5_VLConfig.from_pretrained(folder, trust_remote_code=False)
-        empty: Any = Qwen2_5_VLForConditionalGeneration(config)
-    numbers = sum(tensor.numel() for tensor in empty.model.state_dict().values())
-    shapes = tensor_shapes(files)
-    held = sum(prod(shape) for name, shape in shapes.items() if name not in _UNUSED)
-    if numbers > 2 * held:  # before transformers takes memory for them
-        why = f"expected {numbers:,} numbers in the weights by config.json, found {held:,}"
-        raise VLMS.refusal(folder, why)
-    with quiet_transformers(), VLMS.foreign(folder, what):
+    config = read_config(folder)
+    with quiet_transformers(), VLMS.foreign(folder, "cannot be loaded as Qwen2.5-VL"):
         loaded: Any = Qwen2_5_VLForConditionalGeneration.from_pretrained(
             folder,
             config=config,
@@ -145,7 +115,9 @@ def load_checkpoint(vlm: VLMParams, device: torch.device, dtype: str | None = No
     for name, found, wanted in report["mismatched_keys"]:
         why = f"expected {name} of {list(wanted)} by config.json, found {list(found)}"
         raise VLMS.refusal(folder, why)
-    if numbers != held:
+    shapes = tensor_shapes(files)
+    held = sum(prod(shape) for name, shape in shapes.items() if name not in _UNUSED)
+    if held != sum(tensor.numel() for tensor in model.model.state_dict().values()):
         raise VLMS.refusal(folder, "a tensor stands there by two names")
     return model
 
@@ -175,8 +147,6 @@ def adapted(whole: Any, vlm: VLMParams, dropout: float | None = None) -> Any:
         report = adapting.load_adapter(str(folder), adapter_name="default", is_trainable=learns)
     unexpected = set(report.unexpected_keys)
     _refuse_strange(folder, set(report.missing_keys), unexpected, _ADAPTER_FILES)
-    if not hasattr(adapting, "merge_and_unload"):
-        raise ADAPTERS.refusal(folder, f"a {config.peft_type} adapter cannot be merged")
     return adapting
 
 

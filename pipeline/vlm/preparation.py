@@ -13,7 +13,7 @@ from pipeline.base.config import VLMParams
 from pipeline.base.errors import VLMError
 from pipeline.vlm.augmentation import Augmentation
 from pipeline.vlm.checkpoint_folder import resolve_checkpoint
-from pipeline.vlm.feature_spec import FeatureSpec, row_key
+from pipeline.vlm.feature_spec import FeatureSpec
 from pipeline.vlm.processor import PROMPTS, PixelSettings, PromptRenderer, TokenKind, stretch
 
 FramesByView = Mapping[str, NDArray[np.uint8] | Image.Image]
@@ -111,7 +111,7 @@ class Preparer:
                 row_of.append(-1)
                 continue
             frames = {view: _as_array(frame) for view, frame in given.items()}
-            key = row_key(self._spec, self.render(instruction, tuple(frames)), frames)
+            key = self._spec.row_key(self.render(instruction, tuple(frames)), frames)
             if key not in place:
                 place[key] = len(rows)
                 rows.append(self.prepare(instruction, frames))
@@ -123,7 +123,7 @@ class Preparer:
     ) -> tuple[PreparedRow, ...]:
         """The row once a variant of the spec: 0 as `prepare` makes it, then augmented.
 
-        `key` is the row's (`row_key`): what is drawn depends on nothing else. All have one layout.
+        `key` is the row's key: what is drawn depends on nothing else. All have one layout.
         """
         plain = self.prepare(instruction, frames)
         rows, (height, width) = [plain], self._settings.image_size

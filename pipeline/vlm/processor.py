@@ -4,27 +4,25 @@ The CPU only stretches frames (Pillow), and needs no torch; `extractor` cuts the
 the model is.
 """
 
-import resource
-from collections.abc import Generator
-from contextlib import contextmanager, suppress
+import json
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
+from pydantic import Field, JsonValue
 
-from pipeline.base.border import Border, shown
+from pipeline.base.border import Border, Document, shown
 from pipeline.base.config import VLMParams
 from pipeline.base.errors import VLMError
 from pipeline.vlm.checkpoint_folder import (
     VLMS,
-    ChatTemplate,
-    check_tokenizer,
+    quiet_transformers,
     read_config,
-    read_preprocessor,
     resolve_checkpoint,
+    tokenizer_files,
 )
 
 PROMPTS = Border(
@@ -32,15 +30,16 @@ PROMPTS = Border(
     "Change the instruction in the recording, data.sources or vlm.prompt; fewer data.views and "
     "smaller images make a prompt shorter, too.",
 )
-_MOST_CHARACTERS = 200_000
-"""Of a chat template, and of a prompt before it is cut into tokens."""
-_MOST_MEMORY, _MOST_SECONDS = 2**30, 5.0
-"""What a tokenizer may take to be read (the seconds), and a chat template to be rendered."""
-
 _PART_OF_A_CHARACTER = "\ufffd"
+
+_TOKENIZERS = r"^(Qwen2Tokenizer(Fast)?|PreTrainedTokenizerFast|TokenizersBackend)$"
 
 TokenKind = Literal["text", "special", "image"]
 """What the model reads a token as: words, control, or a part of a picture."""
+
+
+class _TokenizerConfig(Document):
+    tokenizer_class: Annotated[str, Field(pattern=_TOKENIZERS)] | None = None
 
 
 class PromptRenderer:
@@ -57,9 +56,11 @@ class PromptRenderer:
         from transformers import AutoTokenizer  # takes long: types and tokens alone do without
 
         config = read_config(folder)
-        check_tokenizer(folder)
+        tokenizer_files(folder)
+        if (path := folder / "tokenizer_config.json").exists():
+            VLMS.read_json(path, _TokenizerConfig)
         what = "its config.json, tokenizer.json or tokenizer_config.json cannot be read"
-        with VLMS.foreign(folder, what), VLMS.time_limit(f"{folder}: {what}", _MOST_SECONDS):
+        with quiet_transformers(), VLMS.foreign(folder, what):
             self._tokenizer: Any = AutoTokenizer.from_pretrained(
                 folder, local_files_only=True, trust_remote_code=False
             )
@@ -73,8 +74,6 @@ class PromptRenderer:
         self.window = config.text_config.max_position_embeddings
         self._check_vocabulary(config.text_config.vocab_size)
         self._refuse_specials(template, "vlm.prompt")
-        with _memory_limit():
-            self._rendered("", 1)
 
     def render(self, instruction: str, images: int) -> str:
         """The text of one user turn with a placeholder token for each image.
@@ -83,9 +82,6 @@ class PromptRenderer:
         """
         self._refuse_specials(instruction, "the instruction")
         text = self._rendered(instruction, images)
-        if len(text) > _MOST_CHARACTERS:
-            why = f"expected at most {_MOST_CHARACTERS:,} characters, found {len(text):,}"
-            raise PROMPTS.refusal(shown(instruction), why)
         rendered = text.count(self._image_token)
         if rendered != images:
             why = f"the chat template renders {rendered} of {images} images as {self._image_token}"
@@ -114,17 +110,13 @@ class PromptRenderer:
             *({"type": "image"} for _ in range(images)),
             *self._text_part(after, instruction),
         ]
-        what = "the chat template cannot be rendered"
-        where = f"{self._folder}: {what}"
-        limit = VLMS.time_limit(where, _MOST_SECONDS)
-        with VLMS.foreign(self._folder, what), limit, suppress(MemoryError):
+        with VLMS.foreign(self._folder, "the chat template cannot be rendered"):
             return self._tokenizer.apply_chat_template(
                 [{"role": "user", "content": content}],
                 chat_template=self.chat_template,
                 tokenize=False,
                 add_generation_prompt=False,
             )
-        raise VLMS.refusal(where, f"took more than {_MOST_MEMORY:,} bytes")
 
     def _text_part(self, part: str, instruction: str) -> list[dict[str, str]]:
         text = part.replace("{instruction}", instruction)
@@ -147,11 +139,19 @@ class PromptRenderer:
                 f"tokens of a vocabulary of {rows}",
             )
 
+        model = json.loads(self._tokenizer.backend_tokenizer.to_str())["model"]
+        # A merge makes each token of several characters, but for the control tokens.
+        made = sum(len(token) > 1 and token[0] + token[-1] != "<>" for token in model["vocab"])
+        if len(model["merges"]) < made:
+            found = len(model["merges"])
+            why = f"merges are cut off: expected {made} for the vocabulary, found {found}"
+            raise VLMS.refusal(self._folder, why)
+
     def _find_chat_template(self) -> str:
         template, beside = self._tokenizer.chat_template, self._folder / "chat_template.json"
         if not isinstance(template, str) and beside.exists():
-            template = VLMS.read_json(beside, ChatTemplate).chat_template
-        if not isinstance(template, str) or len(template) > _MOST_CHARACTERS:
+            template = VLMS.read_json(beside, dict[str, JsonValue]).get("chat_template")
+        if not isinstance(template, str):
             raise VLMError(
                 f"{self._folder}: no chat template in tokenizer_config.json, chat_template.jinja "
                 "or chat_template.json. Take the file from the checkpoint's hub page."
@@ -200,36 +200,58 @@ class PixelSettings:
         """The settings of a checkpoint folder for frames asked for at `resize` (height, width)."""
         from transformers.models.qwen2_vl.image_processing_pil_qwen2_vl import smart_resize
 
-        config = read_preprocessor(folder)
+        processor = _read_image_processor(folder)
+        size = processor.size
         try:
             image_size = smart_resize(
                 *resize,
-                factor=config.patch_size * config.merge_size,
-                min_pixels=config.min_pixels or config.size.shortest_edge,
-                max_pixels=config.max_pixels or config.size.longest_edge,
+                factor=processor.patch_size * processor.merge_size,
+                min_pixels=size.shortest_edge,
+                max_pixels=size.longest_edge,
             )
         except ValueError as error:
             raise VLMError(
                 f"vlm.image_resize_height and _width {resize[0]} x {resize[1]}: {error}"
             ) from error
-        same = config.model_dump(include={field.name for field in fields(cls)})
-        return cls(resize=resize, image_size=image_size, **same)
+        same = {field.name: getattr(processor, field.name) for field in fields(cls)[2:]}
+        return cls(resize, image_size, **same)
 
 
-@contextmanager
-def _memory_limit() -> Generator[None]:
-    """Raise `MemoryError` where what stands inside asks for another GiB, as a template can at once.
+def _read_image_processor(folder: Path) -> Any:
+    """transformers' image processor of a checkpoint.
 
-    Holds for the process, so only for what is done quickly and before other threads begin.
+    Raises `VLMError` where it does something else than `extractor.patchify`, or its patches are not
+    those of the model.
     """
-    limits, held = resource.getrlimit(resource.RLIMIT_AS), Path("/proc/self/statm")
-    if limits[0] == resource.RLIM_INFINITY and held.exists():  # not on macOS
-        used = int(held.read_text().split()[0]) * resource.getpagesize()
-        resource.setrlimit(resource.RLIMIT_AS, (used + _MOST_MEMORY, limits[1]))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_AS, limits)
+    from transformers.models.qwen2_vl.image_processing_pil_qwen2_vl import Qwen2VLImageProcessorPil
+
+    vision, path = read_config(folder).vision_config, folder / "preprocessor_config.json"
+    with quiet_transformers(), VLMS.foreign(path, "cannot be read"):
+        document, _ = Qwen2VLImageProcessorPil.get_image_processor_dict(
+            folder, local_files_only=True
+        )
+        processor: Any = Qwen2VLImageProcessorPil.from_dict(document)
+        kind = document.get("image_processor_type", "Qwen2VLImageProcessor")
+        processor.image_processor_type = kind.removesuffix("Fast").removesuffix("Pil")
+        expected = {
+            "image_processor_type": "Qwen2VLImageProcessor",
+            "do_resize": True,
+            "do_rescale": True,
+            "do_normalize": True,
+            "resample": Image.Resampling.BICUBIC,
+            "patch_size": vision.patch_size,
+            "merge_size": vision.spatial_merge_size,
+            "temporal_patch_size": vision.temporal_patch_size,
+        }
+        for name, value in expected.items():
+            if (actual := getattr(processor, name)) != value:
+                raise VLMS.refusal(path, f"expected {name} {value}, found {shown(actual)}")
+        scales = [[processor.rescale_factor] * 3, processor.image_std, processor.image_mean]
+        numbers = np.array(scales, np.float64)
+        if numbers.shape != (3, 3) or not np.isfinite(numbers).all() or numbers[:2].min() <= 0:
+            why = "expected three numbers as image_mean and image_std, and scales above 0, found "
+            raise VLMS.refusal(path, why + shown(scales))
+    return processor
 
 
 def stretch(frame: NDArray[np.uint8], image_size: tuple[int, int]) -> NDArray[np.uint8]:

@@ -14,8 +14,8 @@ from torch import Tensor, nn
 from pipeline.base.config import TuningParams, VLMParams
 from pipeline.base.durable import disk_full_named, sync, write_tensors
 from pipeline.base.errors import VLMError
-from pipeline.vlm.checkpoint_folder import resolve_checkpoint
-from pipeline.vlm.loading import adapted, cut, load_checkpoint, load_whole, quiet_transformers
+from pipeline.vlm.checkpoint_folder import quiet_transformers, resolve_checkpoint
+from pipeline.vlm.loading import adapted, cut, load_checkpoint, load_whole
 from pipeline.vlm.slots import Slot
 
 TOWERS = {"language": "model.language_model.", "vision": "model.visual."}

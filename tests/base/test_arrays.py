@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from pipeline.base.bfloat16 import array_of, widen
-from pipeline.base.finite import first_non_finite, non_finite
+from pipeline.base.arrays import array_of, first_non_finite, non_finite, widen
 
 
 @pytest.mark.parametrize("dtype", [np.float16, np.float32, np.float64])

@@ -1,6 +1,5 @@
 """The unpickler that runs nothing."""
 
-import _codecs as codecs
 import builtins
 import io
 import os
@@ -132,7 +131,6 @@ def test_a_hostile_pickle_is_refused_and_nothing_runs(tmp_path, protocol, call):
         ("numpy._core.multiarray", "_reconstruct.__globals__", ()),
         ("numpy.core.multiarray", "os.system", ("touch {mark}",)),
         ("numpy", "ndarray.tofile", ("{mark}",)),
-        ("numpy", "ndarray", ((10**15,),)),
         ("numpy", "dtype", ("O",)),
         ("numpy", "dtype", ([("a", "O")],)),
         ("_codecs", "encode", ("x", "rot13")),
@@ -163,7 +161,7 @@ def test_an_array_with_less_data_than_its_shape_is_refused(tmp_path):
     path = tmp_path / "data.pkl"
     assert content.count(b"K\x04\x85") == 1
     path.write_bytes(content.replace(b"K\x04\x85", b"K\xff\x85"))
-    with pytest.raises(RecordingError, match=r"refused.*255"):
+    with pytest.raises(RecordingError, match=r"damaged pickle: .*buffer size does not match"):
         load_plain(path)
 
 
@@ -185,103 +183,42 @@ def test_a_truncated_pickle_is_damaged_and_accused_of_nothing(tmp_path, keep):
         load_plain(path)
 
 
-SHARED = b"".join(b"h%ch%c\x86\x94" % (n, n) for n in range(60))
-"""Opcodes that put the tuple of memo 0 into a tuple twice, that into another twice, and so on."""
-
-
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        (b"\x80\x02N" + b"\x85" * 600_000 + b".", "more than 500,000 steps"),
-        (b"\x80\x02N" + b"\x85" * 2000 + b".", "nested more than 20 deep"),
-        (b"\x80\x02}(N" + b"2\x86" * 60 + b"Nu.", "DUP, which plain data do not need"),
-        (b"\x80\x04}()\x94" + SHARED + b"Nu.", "a key .* that is a tuple"),
-        (b"\x80\x04)\x94" + SHARED + b".", "nested more than 20 deep"),
-        (b"\x80\x04)\x94" + SHARED[: 6 * 19] + b".", "500,000 values"),
-        (b"\x80\x04cnumpy\ndtype\n)\x94" + SHARED + b"\x89\x88\x87R.", "dtype|callable"),
-        (b"\x80\x04)\x94" + SHARED + b"Q.", "asks for BINPERSID"),
-        (b"\x80\x02U\x05mesh1Q.", "asks for BINPERSID"),
-        (b"\x80\x04)\x94" + SHARED + b"h\x01\x93.", "damaged pickle"),
-        (b"\x80\x02\x8b\x10\0\0\0" + b"\x01" * 16 + b".", "asks for"),
-        (b"\x80\x04]\x94h\0a.", "nested more than 20 deep"),
-        (b"\x80\x02ccollections\nOrderedDict\n]](h\0Neh\0a\x85R.", "damaged pickle"),
-        (pickle.dumps(np.zeros(2), 2)[:-1] + b"K\0K\1s.", "a ndarray with keys"),
-        (b"\x80\x05\x96\0\0\0\0\xff\0\0\0.", "damaged pickle"),
-        (b"\x80\x05\x97.", "NEXT_BUFFER"),
-        (b"\x80\x04\x8e" + b"\xff" * 7 + b"\x7f.", "damaged pickle"),
-        (b"\x80\x02}U\x01acnumpy\ndtype\ns.", "without an array"),
+        (b"\x80\x02N" + b"\x85" * 2000 + b".", "damaged pickle: RecursionError"),
+        (b"\x80\x04]\x94h\0a.", "damaged pickle: RecursionError"),
+        (b"\x80\x02U\x05mesh1Q.", "damaged pickle: UnpicklingError"),
+        (b"\x80\x02\x82\x01.", "damaged pickle: ValueError"),
+        (b"\x80\x05\x97.", "damaged pickle: UnpicklingError"),
+        (global_call("numpy", "ndarray", (10**15,)), "damaged pickle: TypeError"),
+        (b"\x80\x02}U\x01acnumpy\ndtype\ns.", "a dtype or a name without an array"),
+        (b"\x80\x02}cnumpy\ndtype\nNs.", "a dtype or a name without an array"),
+        (pickle.dumps(np.zeros(2), 2)[:-1] + b"K\0U\1xs.", "damaged pickle: ValueError"),
     ],
 )
-def test_what_would_take_for_ever_is_refused_at_once(tmp_path, content, message):
+def test_what_is_no_data_is_refused(tmp_path, content, message):
     path = tmp_path / "data.pkl"
     path.write_bytes(content)
-    mend = "Copy the file" if "damaged" in message else "(Write|Copy) the file"
+    mend = "Copy the file" if "damaged" in message else "Write the file"
     with pytest.raises(RecordingError, match=rf"data\.pkl: .*{message}.*{mend}") as caught:
         load_plain(path)
     assert len(str(caught.value)) < 600
 
 
-SWAPPED = np.zeros(2**17, ">f8").__reduce__()
-
-
-class Again:
-    """Pickles as the same call of the same arguments, whose bytes stand in the file once."""
-
-    def __init__(self, *reduced: object) -> None:
-        self.reduced = reduced
-
-    def __reduce__(self):
-        return self.reduced
-
-
-@pytest.mark.parametrize("protocol", range(6))
-@pytest.mark.parametrize(
-    "reduced",
-    [
-        (codecs.encode, ("a" * 2**20, "latin1")),
-        (set, ([*range(20_000)],)),
-        (frozenset, ([*range(20_000)],)),
-        SWAPPED,
-    ],
-)
-def test_what_stands_once_is_not_copied_again_and_again(tmp_path, reduced, protocol):
-    path = save(tmp_path / "data.pkl", [Again(*reduced) for _ in range(100)], protocol)
-    message = r"data\.pkl: refused: it asks for copies of more than 67,108,864 bytes"
-    with pytest.raises(RecordingError, match=message):
-        load_plain(path)
-
-
-@pytest.mark.parametrize("protocol", range(6))
-@pytest.mark.parametrize("dtype", ["<f8", ">f8"])
-def test_an_array_may_be_copied_once_for_its_byte_order(tmp_path, monkeypatch, dtype, protocol):
-    monkeypatch.setattr("pipeline.data.plain_pickle._COPIED", 0)
-    array = np.arange(99_999.0).astype(dtype)
-    loaded = load_plain(save(tmp_path / "data.pkl", [array], protocol))
-    np.testing.assert_array_equal(loaded[0], array)
-
-
-@pytest.mark.parametrize(
-    ("content", "message"),
-    [
-        (Again(set, ([1, 1],)), "a set that is not made of a list whose members differ"),
-        (Again(set, ((1, 2),)), "a set that is not made of a list whose members differ"),
-        (Again(set, (np.zeros(3),)), "a set that is not made of a list whose members differ"),
-        ({"a" * 50_000: 1}, "a key or a member of a set of more than 40,000 bytes"),
-        (np.str_("a" * 20_000), "a scalar of more than 40,000 bytes"),
-        (Again(*SWAPPED[:2], (1, (1,) * 65, np.dtype("i1"), False, b"a")), "shape, dtype or data"),
-        (Again(*SWAPPED[:2], (1, (0, 2**63), np.dtype("i1"), False, b"")), "shape, dtype or data"),
-    ],
-)
-def test_what_takes_long_again_and_again_is_refused(tmp_path, content, message):
-    path = save(tmp_path / "data.pkl", content, 2 if isinstance(content, Again) else 0)
-    with pytest.raises(RecordingError, match=rf"data\.pkl: refused: .*{message}.*Write the file"):
-        load_plain(path)
-
-
-def test_an_index_of_the_memo_costs_nothing(tmp_path):
+def test_memory_of_another_array_is_not_shared(tmp_path):
+    """So that no state given to the other array later can free it."""
+    numeric = "numpy.core.numeric"
     path = tmp_path / "data.pkl"
-    path.write_bytes(b"K\x00r\xff\xff\xff\x0f.")
-    assert load_plain(path) == 0
+    path.write_bytes(global_call(numeric, "_frombuffer", np.zeros(3), np.dtype("f8"), (3,), "C"))
+    with pytest.raises(RecordingError, match=r"refused.*shares the memory of another"):
+        load_plain(path)
+
+
+def test_a_file_above_the_limit_is_not_read(tmp_path):
+    path = save(tmp_path / "data.pkl", np.zeros(1000))
+    with pytest.raises(RecordingError, match=r"data\.pkl: .*limits\.array_bytes"):
+        load(path, 1000)
 
 
 def test_a_list_that_stands_twice_comes_back(tmp_path):
@@ -332,11 +269,3 @@ def test_random_bytes_never_raise_anything_else(tmp_path):
             load_plain(path)
         except RecordingError as error:
             assert "data.pkl" in str(error)
-
-
-@pytest.mark.parametrize("opcode", [b"\x95", b"\x8e", b"\x96", b"\x8d"])
-def test_a_length_beyond_the_file_takes_no_memory(tmp_path, opcode):
-    path = tmp_path / "data.pkl"
-    path.write_bytes(b"\x80\x05" + opcode + (2**62).to_bytes(8, "little") + b"N.")
-    with pytest.raises(RecordingError, match=r"damaged pickle: (?!not enough memory)"):
-        load_plain(path)

@@ -665,7 +665,7 @@ class TestPlan:
         _, said = run(changed(extract={"plan": True}))
         (warning,) = (line for line in said if line.startswith("WARNING"))
         assert "1 of 4 episode(s) have View7" in warning
-        assert """--set 'data.views=["View1", "View2"]'""" in warning
+        assert "--set 'data.views=[View1, View2]'" in warning
         assert len([line for line in said if line.startswith("why: feature spec")]) < 8
         report, said = run(changed(data={"views": ["View1", "View2"]}))
         assert not any(line.startswith("WARNING") for line in said)

@@ -22,12 +22,12 @@ import yaml
 from pipeline.store.metadata import note_metadata
 from stages.command import run
 from tests.fuzz import oracle
-from tests.fuzz.corpus import ARCHIVE, HEAD, LIMITS, REAL, RECORDINGS, STORE, params
+from tests.fuzz.corpus import ARCHIVE, HEAD, REAL, RECORDINGS, STORE, params
 from tests.fuzz.hostile import CANARY, HOSTILE
 from tests.fuzz.mutations import Change, change_any, rewrite
 
 ROOT = Path(__file__).parents[2]
-_PARTS = {"read": "extract", "load": "evaluate", "limits": "rollout"}
+_PARTS = {"read": "extract", "load": "evaluate"}
 """The parts of commands that read, which take a tenth of the time, and their commands."""
 
 
@@ -48,20 +48,18 @@ class Subject:
 _HEAD = {"evaluate.checkpoint": "{}", "evaluate.store": f"{{corpus}}/{STORE}"}
 SUBJECTS = {
     **{n: Subject("recordings", n, ("read",) * 3 + ("extract",)) for n in (*RECORDINGS, *REAL)},
-    "params": Subject("params", "params.yaml", sets={"extract.plan": "true"}),
-    "limits": Subject("params", "limits.yaml", ("limits",)),
     "vlm": Subject("VLM folders", "vlm", sets={"vlm.checkpoint": "{}"}),
     "adapter": Subject("adapters", "adapter", sets={"vlm.adapter": "{}"}),
     "store": Subject("stores", STORE, ("verify", "verify", "train_head")),
     "archive": Subject("archives", ARCHIVE, ("archive",), {"archive.restore": "true"}),
     "head": Subject("trained heads", HEAD, ("load",) * 3 + ("evaluate",), _HEAD),
 }
-TURN = (
-    ["recordings"] * 9 + ["params"] * 3 + ["VLM folders"] * 2 + ["adapters"] * 2 + ["stores"] * 3
-) + (["archives"] + ["trained heads"] * 2 + ["hostile"] * 3)
+TURN = (["recordings"] * 9 + ["VLM folders"] * 2 + ["adapters"] * 2 + ["stores"] * 3) + (
+    ["archives"] + ["trained heads"] * 2 + ["hostile"] * 3
+)
 """The classes of the cases, over and over."""
 CLASSES = tuple(dict.fromkeys(TURN))
-_BY_SHELL = {"params": 4, "archives": 5, "recordings": 1, "stores": 1, "trained heads": 1}
+_BY_SHELL = {"archives": 5, "recordings": 1, "stores": 1, "trained heads": 1}
 """How many cases of a class, its first, run as a user runs them: a dozen, which takes seconds."""
 
 
@@ -102,8 +100,6 @@ class Case:
             return self.whole[0]
         if self.kind == "hostile":
             return HOSTILE[self.turn % len(HOSTILE)][0]
-        if self.by_shell and self.kind == "params":
-            return "params"  # there is no command for limits but one that has a robot
         names = [n for n, s in SUBJECTS.items() if s.kind == self.kind and n not in REAL]
         real = [name for name in REAL if (self.corpus / name).exists()]
         return self.rng.choice(names + real * (self.kind == "recordings"))
@@ -164,7 +160,6 @@ class Case:
         if data != self.thing:
             document["data"]["root"] = str(self.corpus)
         (self.folder / "params.yaml").write_text(yaml.safe_dump(document, sort_keys=False))
-        (self.folder / "limits.yaml").write_text(yaml.safe_dump(LIMITS))
         if not self.place.exists():
             source = self.corpus / self.subject.place
             shutil.copytree(source, self.place, copy_function=os.link)
@@ -192,11 +187,7 @@ class Case:
             environment = os.environ | {"PYTHONPATH": str(ROOT)}
             command = [sys.executable, *self.command[1:]]
             return subprocess.run(command, env=environment, check=False).returncode
-        parts = {
-            "read": oracle.read_all,
-            "load": oracle.load_head,
-            "limits": lambda _: oracle.load_limits(self.place),
-        }
+        parts = {"read": oracle.read_all, "load": oracle.load_head}
         return run("", parts.get(self.stage, f"stages.{self.stage}"), self.arguments)
 
     def judge(self, change: Change) -> str:

@@ -27,25 +27,16 @@ STORE, ARCHIVE, HEAD = "store.zarr", "archive.zarr", "head"
 
 
 def write_corpus(root: Path, real: Path | None) -> None:
-    """Recordings, a checkpoint, an adapter, a store, its archive, a head, params and limits."""
+    """Recordings, a checkpoint, an adapter, a store, its archive and a head."""
     for name in REAL if real else ():
         shutil.copytree(real / "insertion" / name.removeprefix("real_"), root / name)
     write_recordings(root, seed=0)
     write_recordings(root / "other", seed=1)
     write_model(root)
     (root / "params.yaml").write_text(yaml.safe_dump(params(root, "lerobot_images", root)))
-    (root / "limits.yaml").write_text(yaml.safe_dump(LIMITS))
     for stage in (extract, archive, train_head):
         code = run("", stage.main, ["--params", str(root / "params.yaml")])
         assert code == 0, f"{stage.__name__} cannot make the corpus"
-
-
-LIMITS = {
-    "step": {"most": {"x": 5.0}, "on_exceed": "clip"},
-    "speed": {"most": {"x": 40.0}},
-    "workspace": {"box": {"a": [-100.0, 100.0]}},
-    "force": {"most": {"force": 2.5}},
-}
 
 
 def params(root: Path, subject: str, case: Path) -> dict[str, Any]:

@@ -1,6 +1,6 @@
 """What a command has read or made, and what it should have; and when a refusal is clear.
 
-What recordings and params say is read once more by a plain reader. What has digests of its own
+What recordings say is read once more by a plain reader. What has digests of its own
 (stores, archives, heads) must come out as it was written. Features may be others where they are
 called by another name.
 """
@@ -14,11 +14,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import yaml
 import zarr
 from safetensors.numpy import load_file
 
-from pipeline.base.config import LimitsFile, Params, load_params, load_section
+from pipeline.base.config import load_params
 from pipeline.base.digests import ContentDigests, ledger_path
 from pipeline.base.errors import StoreIncomplete
 from pipeline.data import RecordedAction
@@ -35,7 +34,7 @@ if TYPE_CHECKING:
     from tests.fuzz.cases import Case
 
 read: Any = None
-"""What `read_all`, `load_head` or `load_limits` read in this process."""
+"""What `read_all` or `load_head` read in this process."""
 
 # --- the parts of commands that read -------------------------------------------------------------
 
@@ -82,23 +81,14 @@ def load_head(params: Any) -> None:
     read = {"document": said, "weights": weights}
 
 
-def load_limits(path: Path) -> None:
-    """Load a file of limits."""
-    global read
-    read = json.loads(load_section(path, LimitsFile).model_dump_json())
-
-
 # --- what came out -------------------------------------------------------------------------------
 
 
 def result(case: "Case") -> Any:
     """What a command that ended with 0 has read or made."""
     match case.subject.kind, case.stage:
-        case _, "read" | "load" | "limits":
+        case _, "read" | "load":
             return read
-        case "params", _:
-            document = load_params(case.folder / "params.yaml").model_dump_json()
-            return json.loads(document.replace(str(case.folder), "CASE"))
         case "stores", "train_head":
             return load_file(case.folder / HEAD / "best/policy.safetensors")
         case "trained heads", _:
@@ -146,10 +136,10 @@ def judge(case: "Case", change: Change) -> str:
     unknown = case.subject.kind in ("VLM folders", "adapters")  # features, that nobody else knows
     if not why and (unknown or not case.whole):
         return ""
-    # A limit may be of a channel of any name; and of a data set, episodes whose files are not
-    # there are told and passed over, whatever stands in the place of a file.
+    # Of a data set, episodes whose files are not there are reported and passed over, whatever
+    # stands in the place of a file.
     told = case.thing.startswith("lerobot") and change.path.suffix in (".parquet", ".mp4")
-    excepted = case.thing == "limits" or (told and not change.path.is_file())
+    excepted = told and not change.path.is_file()
     if why and change.permits in ("same", "refuse") and not excepted:
         return f"gave other data than before: {why}"
     return _as_it_stands(case, found, before, change, why)
@@ -168,12 +158,6 @@ def _as_it_stands(case: "Case", found: Any, before: Any, change: Change, why: st
     """What differs from what the files of a case say, read plainly."""
     strange = f"{change.key} is of a strange type and was taken" * (change.permits == "type")
     match case.subject.kind:
-        case "params":
-            document = yaml.load(case.place.read_bytes(), _Undated)
-            text = json.dumps(document, default=bytes.decode)
-            return differ(
-                "", json.loads(text.replace(str(case.folder), "CASE")), found, partly=True
-            )
         case "VLM folders" | "adapters":
             if not np.isfinite(found["vl/features"]).all():
                 return "features are not finite"
@@ -218,13 +202,6 @@ def _not_stored(episodes: dict[str, plain.Episode], store: Path) -> str:
     return ""
 
 
-class _Undated(yaml.SafeLoader):
-    """YAML in which a date is a text, as no key holds a date."""
-
-
-_Undated.add_constructor("tag:yaml.org,2002:timestamp", yaml.SafeLoader.construct_yaml_str)
-
-
 def differ(where: str, said: Any, taken: Any, partly: bool = False) -> str:
     """The first place at which two documents of objects, lists, arrays and values differ.
 
@@ -259,8 +236,7 @@ def differ(where: str, said: Any, taken: Any, partly: bool = False) -> str:
 # --- when a refusal is clear ---------------------------------------------------------------------
 
 MOST = 2000
-"""Characters of a message; params list every problem, by contract."""
-MOST_OF_PARAMS = 5000
+"""Characters of a message."""
 MEND = re.compile(
     r"(?:^|[.;:,)]\s+|\(|\n\s*|\b(?:or|and|then|please|to) )"
     r"(add|copy|correct|convert|choose|cut|delete|download|drop|export|extract|free|give|have|keep|"
@@ -281,7 +257,7 @@ def unclear(stderr: str, change: Change, case: "Case") -> str:
     text = stderr.strip()
     if not text.startswith("error: ") or len(re.findall(r"^error: ", text, re.MULTILINE)) != 1:
         return "not one message that begins with `error: `"
-    if len(text) > (MOST_OF_PARAMS if case.subject.kind == "params" else MOST):
+    if len(text) > MOST:
         return f"{len(text)} characters"
     if strange := FOREIGN.search(text):
         return f"speaks of {strange[0]}"
@@ -294,16 +270,12 @@ def _names(text: str, change: Change, case: "Case") -> bool:
     """Whether a message names the changed file.
 
     Of a file that is still one of its kind, it may name another file of the same thing, which the
-    first contradicts; of a store's file the folder of its array; of params the key alone.
+    first contradicts; of a store's file the folder of its array.
     """
     name = change.path.name.encode("utf-8", "backslashreplace").decode()
     if (len(name) > 1 and name in text) or repr(change.path.name)[1:-1] in text.split("/"):
         return True
     match case.subject.kind:
-        case "params":
-            sections = [f"{name}." for name in Params.model_fields]  # a changed byte has no key
-            keys = change.key.split(".") if change.key else sections
-            return any(key in text for key in keys)
         case "stores" | "archives":
             above = [path for path in change.path.parents if path.is_relative_to(case.place)]
             return any(str(path) in text for path in above if path != case.place)

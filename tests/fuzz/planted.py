@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 
-import pipeline.base.config.sections as sections
 import pipeline.policy.checkpoint as checkpoint
 import stages.verify
 from pipeline.base.errors import CheckpointIncomplete
@@ -87,12 +86,6 @@ def _altered(load: Any) -> Any:
     return lambda policy, weights: load(policy, more(weights))
 
 
-def _reread(check: Any) -> Any:
-    """A number of params that is taken for another."""
-    data = {"vlm_reuse_count": 2}
-    return lambda document: check({**document, "data": {**document["data"], **data}})
-
-
 def _unreadable(seal: Any) -> Any:
     """A store that plain zarr reads and its own readers refuse."""
 
@@ -108,7 +101,6 @@ WHOLES = {
     "extraction": ("raw", "extract"),
     "store": ("store", "verify"),
     "head": ("head", "load"),
-    "params": ("params", "extract"),
 }
 FAULTS: dict[str, tuple[str, str, Callable[[], object]]] = {
     "a sensor of zeros": ("raw", "wrong", _sensor(lambda s: replace(s, values=0 * s.values))),
@@ -133,11 +125,6 @@ FAULTS: dict[str, tuple[str, str, Callable[[], object]]] = {
         _refuse("head: not enough memory for it. Copy it again."),
     ),
     "weights of another head": ("head", "wrong", _plant(Policy, "load_state_dict", _altered)),
-    "params that nobody wrote": (
-        "params",
-        "wrong",
-        _plant(sections.Params, "model_validate", _reread),
-    ),
     "a KeyError": ("raw", "traceback", _sensor(_raise)),
     "a loop": ("raw", "hang", _sensor(_spin)),
     "a segmentation fault": ("raw", "crash", _sensor(lambda stream: ctypes.string_at(0))),

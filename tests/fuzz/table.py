@@ -5,7 +5,7 @@ python -m tests.fuzz.table --seed 1 --case 77 --corpus DIR   one case; keeps its
 
 How it works:
 1. corpus.py writes one small thing of every kind that commands read: recordings of each format, a
-   checkpoint, an adapter, a store, its archive, a head, params and limits.
+   checkpoint, an adapter, a store, its archive and a head.
 2. cases.py chooses, by the seed and the case's number alone: a thing, what is done to it, and the
    command that reads it. The thing is laid into a folder of its own, in hard links.
 3. mutations.py has what chance does to a file, by the kind of file; hostile.py, what somebody would

@@ -24,7 +24,7 @@ from pipeline.simulation.environment import InsertionEnvironment
 from pipeline.simulation.insertion_formats import INSTRUCTION
 from pipeline.simulation.rendering import VIEWS
 from pipeline.store import FeatureStore
-from pipeline.vlm.feature_spec import FeatureSpec, feature_spec, row_key
+from pipeline.vlm.feature_spec import FeatureSpec, feature_spec
 from pipeline.vlm.preparation import Preparer
 
 REUSE = 3
@@ -124,7 +124,7 @@ def live(vlm: dict[str, Any], tmp_path_factory: pytest.TempPathFactory):
 
     def key_of(frames: Frames) -> bytes:
         seen = {view: image for view, (_, image) in frames.items()}
-        return row_key(spec, preparer.render(INSTRUCTION, list(seen)), seen)
+        return spec.row_key(preparer.render(INSTRUCTION, list(seen)), seen)
 
     return spec, key_of
 

@@ -16,7 +16,7 @@ from PIL import Image, ImageEnhance
 
 from pipeline.base.config import AugmentationParams
 from pipeline.vlm.augmentation import Augmentation
-from pipeline.vlm.feature_spec import AUGMENTATION_VERSION, row_key
+from pipeline.vlm.feature_spec import AUGMENTATION_VERSION
 
 KEY = bytes(range(16))
 PLAIN = Augmentation(0.0, 1.0, (0.0, 0.0), 1.0, 1.0, 1.0)
@@ -200,7 +200,7 @@ class TestPreparer:
         self, extractor: Callable[..., Any], frames: dict[str, Frame]
     ) -> None:
         ours = extractor(variants=3)
-        key = row_key(ours.spec, "prompt", frames)
+        key = ours.spec.row_key("prompt", frames)
         rows = ours.preparer.prepare_variants("go", frames, key)
         plain = extractor().preparer.prepare("go", frames)
         assert len(rows) == 3

@@ -21,7 +21,6 @@ from pipeline.vlm.checkpoint_folder import resolve_checkpoint, weight_files
 from pipeline.vlm.feature_spec import (
     FeatureSpec,
     feature_spec,
-    row_key,
 )
 from pipeline.vlm.slots import Slot
 
@@ -134,7 +133,7 @@ def test_digest_and_keys_move_with_variants_and_augmentation(
         spec_of(variants=3, augmentation={"rotation_deg": 4}),
     ]
     assert len({spec.digest for spec in specs}) == len(specs)
-    assert len({row_key(spec, "go", {}) for spec in specs}) == len(specs)
+    assert len({spec.row_key("go", {}) for spec in specs}) == len(specs)
     assert differences(specs[0].attrs(), specs[2].attrs())["variants"] == (None, 3)
     assert differences(specs[2].attrs(), specs[3].attrs()) == {"augmentation.seed": (0, 1)}
 
@@ -249,21 +248,21 @@ def test_row_key_moves_with_spec_prompt_pixels_shape_and_view(
     reshaped = frames | {"View1": frames["View1"].reshape(32, 24, 3)}
     alone = frames["View1"]
     keys = [
-        row_key(spec, "go", frames),
-        row_key(spec_of(dtype="float16"), "go", frames),
-        row_key(spec, "go ", frames),
-        row_key(spec, "go", one_value),
-        row_key(spec, "go", swapped),
-        row_key(spec, "go", reshaped),
-        row_key(spec, "go", {"View1": alone}),
-        row_key(spec, "go", {"View2": alone}),
-        row_key(spec, "go", {}),
+        spec.row_key("go", frames),
+        spec_of(dtype="float16").row_key("go", frames),
+        spec.row_key("go ", frames),
+        spec.row_key("go", one_value),
+        spec.row_key("go", swapped),
+        spec.row_key("go", reshaped),
+        spec.row_key("go", {"View1": alone}),
+        spec.row_key("go", {"View2": alone}),
+        spec.row_key("go", {}),
     ]
     assert all(len(key) == 16 for key in keys)
     assert len(set(keys)) == len(keys)
     backwards = dict(reversed(frames.items()))
     strided = {view: np.asfortranarray(frame) for view, frame in backwards.items()}
-    assert row_key(spec, "go", strided) == keys[0]
+    assert spec.row_key("go", strided) == keys[0]
 
 
 @pytest.mark.parametrize(

@@ -136,15 +136,3 @@ def test_a_tokenizer_named_by_its_general_class_gives_the_same_tokens(
     own, general = (PromptRenderer(path, "{instruction}") for path in (demo_checkpoint, copy))
     text = own.render("insert the needle, 3 mm!", 0)
     assert general.tokenize(general.render("insert the needle, 3 mm!", 0)) == own.tokenize(text)
-
-
-def test_a_tokenizer_that_takes_too_long_is_refused(
-    copy: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    _edit(copy / "tokenizer_config.json", extra_special_tokens=[f"<{i}>" for i in range(50_000)])
-    monkeypatch.setattr("pipeline.vlm.processor._MOST_SECONDS", 0.1)
-    with pytest.raises(
-        VLMError,
-        match=r"tokenizer_config\.json cannot be read: was not done after 0\.1 s",
-    ):
-        PromptRenderer(copy, "{instruction}")

@@ -10,7 +10,7 @@ Most = dict[str, Annotated[float, Field(gt=0, le=1e12)]]
 
 
 class MotionLimit(Section):
-    """How large a motion may be, and what becomes of a larger one."""
+    """The largest motion, and the reaction to a larger one."""
 
     most: Most
     """By `translation` or `rotation`, the length of these channels together, or by the name of an
@@ -20,21 +20,21 @@ class MotionLimit(Section):
 
 
 class Workspace(Section):
-    """Where the robot may be."""
+    """The space in which the robot may be."""
 
     box: dict[str, tuple[float, float]]
     """Lowest and highest reading by the name of a state's channel."""
 
 
 class Force(Section):
-    """How hard the robot may press."""
+    """The largest force of the robot."""
 
     most: Most
     """Largest size of a reading by the name of a sensor's channel."""
 
 
 class LimitsFile(Section):
-    """The content of a limits file; what is not given is not limited."""
+    """The content of a limits file; a missing entry is no limit."""
 
     step: MotionLimit | None = None
     """Of one action, in the units of the action."""

@@ -1,10 +1,7 @@
 """Read params.yaml and other YAML of sections: the only place that reads YAML."""
 
-import json
-import re
 import shlex
 from collections.abc import Sequence
-from contextlib import suppress
 from difflib import get_close_matches
 from itertools import islice
 from pathlib import Path
@@ -20,9 +17,6 @@ from pipeline.base.errors import ConfigError
 
 _Section = TypeVar("_Section", bound=Section)
 
-_MOST_BYTES, _MOST_VALUES, _MOST_LEVELS = 2**20, 50_000, 50
-"""Of a document; those of people have a hundredth."""
-_NUMBERS = ("!!int", "!!float", "!!bool", "!!null")
 _MOST_TOLD = 50
 """Problems that one message lists."""
 _FILE = Border(ConfigError, "Run from the project's root, name it (--params FILE), or correct it.")
@@ -32,7 +26,7 @@ _SET = Border(
     "--set 'section.key=\"a text\"'.",
 )
 _REPLACED = {
-    "train_head.val_fraction": "is no longer a key, for episodes are split three ways. Write "
+    "train_head.val_fraction": "is no longer a key, because episodes are split three ways. Write "
     "train_head.split={val: 0.15, test: 0.15}: val chooses the checkpoint and stops early, test is "
     "what stages.evaluate reports on",
     **dict.fromkeys(
@@ -41,7 +35,7 @@ _REPLACED = {
         "training std off the policy. Remove it",
     ),
 }
-"""Keys of earlier versions, and what takes their place."""
+"""Keys of earlier versions, and their replacements."""
 
 
 def load_params(path: Path, overrides: Sequence[str] = ()) -> Params:
@@ -65,17 +59,18 @@ def load_section(path: Path, section: type[_Section]) -> _Section:
 
 
 def setting(key: str, value: Path | Sequence[str]) -> str:
-    """`--set key=value` for advice: typed into a shell as it is printed, it gives this value."""
-    text = str(value)
-    if not re.fullmatch(r"[\w./+-]+", text) or _parse(text, _SET, text) != text:
-        text = json.dumps(value, ensure_ascii=False, default=str)
-        text = text if text.isprintable() else json.dumps(value, default=str)
+    """`--set key=value` for advice: pasted into a shell, it gives this value."""
+    texts = [str(value)] if isinstance(value, Path) else list(value)
+    text = yaml.safe_dump(
+        texts, default_flow_style=True, allow_unicode=True, width=float("inf")
+    ).strip()
+    text = text[1:-1] if isinstance(value, Path) else text
     return f"--set {shlex.quote(f'{key}={text}')}"
 
 
 def _read(path: Path) -> dict[str, Any]:
     """The keys of a YAML file."""
-    document = _parse(_FILE.read_bytes(path, _MOST_BYTES), _FILE, path)
+    document = _parse(_FILE.read_bytes(path), _FILE, path)
     if not isinstance(document, dict):
         raise _FILE.refusal(path, f"expected sections such as `data:`, found {shown(document)}")
     return document
@@ -90,85 +85,42 @@ def _lay_over(document: dict[str, Any], override: str) -> None:
     for depth, key in enumerate(keys[:-1], start=1):
         child = node.get(key)
         if child is None:
-            child = node[key] = {}
+            child = {}
         if not isinstance(child, dict):
             above = named(".".join(keys[:depth]))
             why = f"{above} is a {type(child).__name__}, not a section; set it whole"
             raise _SET.refusal(where, why)
-        node = child
+        # A copy, for an alias shares it with another section.
+        node[key] = dict(child)
+        node = node[key]
     node[keys[-1]] = value
 
 
 class _Loader(yaml.SafeLoader):
-    """YAML of texts, numbers, true, false, null, lists and sections; a date is a text."""
+    """The safe loader, which also refuses a key that stands twice in a section."""
 
-    yaml_implicit_resolvers = {  # noqa: RUF012
-        first: [(tag, pattern) for tag, pattern in known if not tag.endswith(":timestamp")]
-        for first, known in yaml.SafeLoader.yaml_implicit_resolvers.items()
-    }
-    left = _MOST_VALUES
-
-    def value(self, node: yaml.Node, depth: int = 1) -> Any:
-        """What a node holds. An alias gives a value of its own, which counts each time."""
-        self.left -= 1
-        if self.left < 0 or depth > _MOST_LEVELS:
-            at_most = f"at most {_MOST_VALUES:,} values in {_MOST_LEVELS} levels"
-            raise _wrong(node, f"expected {at_most}, found more")
-        tag = node.tag.replace("tag:yaml.org,2002:", "!!")
-        found = named(tag)
-        if isinstance(node, yaml.SequenceNode) and tag == "!!seq":
-            return [self.value(inner, depth + 1) for inner in node.value]
-        if isinstance(node, yaml.MappingNode) and tag == "!!map":
-            values, merged = dict[str, Any](), dict[str, Any]()
-            for key_node, inner in node.value:
-                if key_node.tag == "tag:yaml.org,2002:merge":
-                    given = self.value(inner, depth + 1)
-                    for one in reversed(given if isinstance(given, list) else [given]):
-                        if not isinstance(one, dict):
-                            raise _wrong(inner, f"expected a section to merge, found {shown(one)}")
-                        merged |= one
-                    continue
-                key = self.value(key_node, depth + 1)
-                if not isinstance(key, str) or key in values:
-                    said = f"expected a text that stands once as a key, found {shown(key)}"
-                    raise _wrong(key_node, said)
-                values[key] = self.value(inner, depth + 1)
-            return merged | values
-        if isinstance(node, yaml.ScalarNode):
-            found = f"{found} {shown(node.value)}"
-            with suppress(ValueError, KeyError):  # half a surrogate pair, a bool that is none
-                if tag == "!!str" and len(node.value) <= 10_000 and "\0" not in node.value:
-                    return node.value.encode("utf-16", "surrogatepass").decode("utf-16")
-                # As it would be without the tag: yaml takes `!!float --1` for 1.
-                plain = self.resolve(yaml.ScalarNode, node.value, (True, False)) == node.tag
-                if plain and tag in _NUMBERS and len(node.value) <= 400:
-                    return self.construct_object(node)
-        raise _wrong(
-            node,
-            "expected a text (Unicode, no NUL, at most 10,000 characters), a number (at most 400), "
-            f"true, false, null, a list or a section, found {found}",
-        )
-
-
-def _wrong(node: yaml.Node, why: str) -> yaml.MarkedYAMLError:
-    return yaml.MarkedYAMLError(problem=why, problem_mark=node.start_mark)
+    def compose_mapping_node(self, anchor: Any) -> Any:
+        """The section; PyYAML itself would keep the last of two equal keys."""
+        node: Any = super().compose_mapping_node(anchor)
+        keys = set[str]()
+        for key, _ in node.value:
+            if isinstance(key, yaml.ScalarNode) and key.value in keys:
+                why = f"the key {shown(key.value)} stands twice in one section"
+                raise yaml.MarkedYAMLError(problem=why, problem_mark=key.start_mark)
+            keys.add(str(key.value))
+        return node
 
 
 def _parse(text: bytes | str, border: Border, where: Path | str) -> Any:
     """The one document of a text."""
-    try:
-        loader = _Loader(text)
-        node = loader.get_single_node()
-        return None if node is None else loader.value(node)
-    except RecursionError:
-        why = f"expected at most {_MOST_LEVELS} levels, found more"
-    except yaml.MarkedYAMLError as error:
-        mark = error.problem_mark or error.context_mark
-        at = f"line {mark.line + 1}, column {mark.column + 1}: " if mark else ""
-        why = f"{at}{error.problem:.1000}"
-    except yaml.reader.ReaderError as error:
-        why = f"character {error.position + 1}: {error.reason}"
-    raise border.refusal(where, f"cannot be read as YAML: {why}")
+    with border.foreign(where, "cannot be read as YAML"):
+        try:
+            return yaml.load(text, _Loader)
+        except yaml.MarkedYAMLError as error:
+            mark = error.problem_mark or error.context_mark
+            at = f"line {mark.line + 1}, column {mark.column + 1}: " if mark else ""
+            why = f"cannot be read as YAML: {at}{error.problem}"
+            raise border.refusal(where, why) from None
 
 
 def _as_section(document: dict[str, Any], section: type[_Section], where: str) -> _Section:
@@ -176,16 +128,16 @@ def _as_section(document: dict[str, Any], section: type[_Section], where: str) -
         return section.model_validate(document)
     except ValidationError as error:
         lines = [f"{named(where)}: {error.error_count()} problem(s)"]
-        for place, said in islice(problems(error), _MOST_TOLD):
-            if said.startswith("unknown key"):
-                said = _REPLACED.get(place) or _unknown_key(place.split("."), section)
-            lines.append(f"  {place or section.__name__.lower()}: {said}")
+        for place, why in islice(problems(error), _MOST_TOLD):
+            if why.startswith("unknown key"):
+                why = _REPLACED.get(place) or _unknown_key(place.split("."), section)
+            lines.append(f"  {place or section.__name__.lower()}: {why}")
         lines.append(f"Correct {'it' if len(lines) == 2 else 'them'}, and run the same again.")
         raise ConfigError("\n".join(lines)) from None
 
 
 def _unknown_key(place: Sequence[str], root: type[BaseModel]) -> str:
-    """The key that was likely meant, else all that may stand there."""
+    """The key that was likely meant, or else all keys of the section."""
     section: Any = root
     for part in place[:-1]:
         if part in section.model_fields:
@@ -197,7 +149,7 @@ def _unknown_key(place: Sequence[str], root: type[BaseModel]) -> str:
 
 
 def _section_in(annotation: Any) -> Any:
-    """The section that a field holds, or that its tuple does."""
+    """The section that a field or its tuple holds."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return annotation
     return _section_in(next(part for part in get_args(annotation) if part is not Ellipsis))

@@ -1,4 +1,4 @@
-"""What every section of params.yaml is made of."""
+"""The base of every section of params.yaml, and types of its fields."""
 
 import os
 from pathlib import Path
@@ -53,13 +53,13 @@ Output = Annotated[Place, AfterValidator(_is_apart)]
 """A folder that a command writes."""
 
 
-def _keeps_truth(given: Any, taken: Any) -> bool:
-    """Whether no true or false was taken for a number."""
-    if isinstance(given, dict) and isinstance(taken, dict):
-        return all(_keeps_truth(value, taken.get(key)) for key, value in given.items())
-    if isinstance(given, list | tuple) and isinstance(taken, list | tuple):
-        return all(map(_keeps_truth, given, taken))
-    return isinstance(taken, bool) or not isinstance(given, bool)
+def _keeps_truth(value: Any, parsed: Any) -> bool:
+    """Whether no true or false became a number."""
+    if isinstance(value, dict) and isinstance(parsed, dict):
+        return all(_keeps_truth(inner, parsed.get(key)) for key, inner in value.items())
+    if isinstance(value, list | tuple) and isinstance(parsed, list | tuple):
+        return all(map(_keeps_truth, value, parsed))
+    return isinstance(parsed, bool) or not isinstance(value, bool)
 
 
 class Section(BaseModel):
@@ -71,7 +71,7 @@ class Section(BaseModel):
 
     @field_validator("*", mode="wrap")
     @classmethod
-    def _no_truth_for_a_number(cls, given: Any, take: ValidatorFunctionWrapHandler) -> Any:
-        if not _keeps_truth(given, taken := take(given)):
+    def _no_truth_for_a_number(cls, value: Any, parse: ValidatorFunctionWrapHandler) -> Any:
+        if not _keeps_truth(value, parsed := parse(value)):
             raise ValueError("expected a number, found true or false")
-        return taken
+        return parsed

@@ -1,4 +1,4 @@
-"""All sections together, and their keys described for people."""
+"""All sections together, and the description of their keys."""
 
 import inspect
 import json
@@ -59,7 +59,7 @@ class Params(Section):
 
 
 def described_keys(sections: Sequence[str]) -> list[str]:
-    """Every key of these sections: a line with its default, and what it means below."""
+    """Every key of these sections: a line with its default, and its meaning below."""
     lines: list[str] = []
     for name in sections:
         section = Params.model_fields[name].annotation

@@ -10,7 +10,7 @@ from sklearn.preprocessing import StandardScaler
 from sklearn.utils.extmath import randomized_svd
 from tqdm import tqdm
 
-from pipeline.base.bfloat16 import widen
+from pipeline.base.arrays import widen
 from pipeline.store import FeatureStore
 from pipeline.train.statistics import check_finite
 from pipeline.vlm.slots import Slot

@@ -18,7 +18,7 @@ from pipeline.simulation.recorder import simulate_episode
 from pipeline.store import FeatureStore
 from pipeline.train.finetuning.recordings import check_spec, find_recordings, known_digests
 from pipeline.train.finetuning.rows import LiveRows
-from pipeline.vlm.feature_spec import FeatureSpec, row_key
+from pipeline.vlm.feature_spec import FeatureSpec
 from pipeline.vlm.preparation import PreparedRow, Preparer
 
 
@@ -32,7 +32,7 @@ class Watched(Preparer):
 
     def prepare(self, instruction: str, frames: Mapping[str, NDArray[np.uint8]]) -> PreparedRow:
         prompt = self.render(instruction, list(frames))
-        self.keys[row_key(self.spec, prompt, frames)] += 1
+        self.keys[self.spec.row_key(prompt, frames)] += 1
         return super().prepare(instruction, frames)
 
 
