@@ -201,7 +201,7 @@ class _Run:
         }
         self.watched = tuple(self.pending) if settings.watch is None else settings.watch
         self.clock = RobotClock(settings.clock_offset_s, settings.clock_drift_s)
-        self.report = RunReport(self.hz, meta["action_dim"])
+        self.report = RunReport(meta["action_dim"])
         self.timer, self.missed_in_a_row = TickTimer(), 0
         self.unrecorded: tuple[Mapping[str, Any], NDArray[np.float64] | None] | None = None
         self.begin_episode()

@@ -89,8 +89,8 @@ class TickTimer:
 
     def row_ms(self) -> list[float]:
         """The ms of each of `TICK_PARTS`, NaN of a part that did not happen, and of the tick."""
-        parts = [1000 * self.seconds.get(part, math.nan) for part in TICK_PARTS]
-        return [*parts, float(np.nansum(parts[1:]))]
+        tick = sum(seconds for part, seconds in self.seconds.items() if part != "late")
+        return [*(1000 * self.seconds.get(part, math.nan) for part in TICK_PARTS), 1000 * tick]
 
 
 @dataclass(frozen=True)
@@ -109,8 +109,7 @@ class MissedTick:
 class RunReport:
     """How a run went and why it ended; timings and actions are of the newest `KEPT` ticks."""
 
-    def __init__(self, hz: float, action_dim: int) -> None:
-        self.hz = hz
+    def __init__(self, action_dim: int) -> None:
         self.kind, self.reason = StopKind.LOOP, "the process ends"
         self.tick_timings = Timings((*TICK_PARTS, "tick"), KEPT)
         self.answer_timings = Timings(ANSWER_PARTS, KEPT)

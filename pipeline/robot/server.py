@@ -98,7 +98,7 @@ class ServerStatus:
     """Counts and latencies of a server's answers, and what it serves."""
 
     def __init__(self, metadata: Mapping[str, Any]) -> None:
-        self.refused = self.busy = 0
+        self.connected = self.refused = self.busy = 0
         shown = ("checkpoint", "step", "model_type", "action_hz", "feature_spec_digest")
         self._policy = {name: metadata[name] for name in shown}
         self._timings, self._since_s = Timings(_TIMED, _KEPT), monotonic()
@@ -109,11 +109,11 @@ class ServerStatus:
         with self._lock:
             self._timings.note([timing[part] or math.nan for part in _TIMED])
 
-    def json(self, connected: int) -> str:
-        """The content of `/status.json`, with the number of robots that are connected."""
+    def json(self) -> str:
+        """The content of `/status.json`."""
         with self._lock:
             answered, latency = self._timings.count, self._timings.document()
-        counts = {"connected": connected, "answered": answered}
+        counts = {"connected": self.connected, "answered": answered}
         counts |= {"refused": self.refused, "busy": self.busy}
         seconds = monotonic() - self._since_s
         document = {"policy": self._policy, "seconds": seconds, "counts": counts}
@@ -194,7 +194,9 @@ class PolicyServer:
 
     async def _converse(self, connection: ServerConnection) -> None:
         """One robot, from its metadata to its last answer."""
-        with suppress(ConnectionClosed, TimeoutError):
+        # Counted until its last observation is answered, which may be after it has left.
+        self.status.connected += 1
+        try:
             await connection.send(wire.pack(self._served.metadata))
             session = self._served.session(self._params.fresh, self._params.seed)
             code = None
@@ -208,6 +210,10 @@ class PolicyServer:
             else:
                 self.status.refused += 1
                 await connection.close(code)
+        except (ConnectionClosed, TimeoutError):
+            pass  # The robot has left, or sends nothing.
+        finally:
+            self.status.connected -= 1
 
     async def _next(self, connection: ServerConnection) -> str | bytes:
         """The next message; closes a connection that sends none."""
@@ -280,14 +286,14 @@ class PolicyServer:
         if not authorized:
             why = "expected the header Authorization: Api-Key <the server's token>\n"
             return say(HTTPStatus.UNAUTHORIZED, why, **{"WWW-Authenticate": "Api-Key"})
-        connected, most = len(connection.server.connections), self._params.max_connections
         if path == "/status.json":
             kind = {"Content-Type": "application/json"}
-            return say(HTTPStatus.OK, self.status.json(connected), **kind)
+            return say(HTTPStatus.OK, self.status.json(), **kind)
         if not opens:
             why = "expected a websocket at /, /healthz or /status.json\n"
             return say(HTTPStatus.NOT_FOUND, why)
-        if connected < most:
+        most = self._params.max_connections
+        if self.status.connected < most:
             return None
         why = f"busy: {most} robots are connected (serve.max_connections)\n"
         return say(HTTPStatus.SERVICE_UNAVAILABLE, why)

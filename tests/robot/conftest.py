@@ -1,9 +1,10 @@
 """A head trained on a recorded episode; and a policy of the phantom, a stand-in for its model and a
 server in this process."""
 
+import gc
 import socket
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,8 @@ from pipeline.extract.run import extract
 from pipeline.policy.checkpoint import PolicyCheckpoint, find_policy, load_policy
 from pipeline.policy.observation import PolicyShape
 from pipeline.policy.policy import Policy
+from pipeline.robot import process
+from pipeline.robot.process import PolicyThread
 from pipeline.robot.server import PolicyServer, listen
 from pipeline.robot.session import ServedPolicy
 from pipeline.simulation.insertion_formats import INSTRUCTION, write_raw
@@ -108,6 +111,46 @@ def phantom_policy() -> Callable[..., tuple[PolicyCheckpoint, Policy, Glance]]:
     """`phantom_policy(model_type, key=value, ...)`: a policy of few random weights for the phantom,
     its checkpoint, and what stands for its model."""
     return build_policy
+
+
+class SimulatedTime:
+    """A clock that only sleeping moves."""
+
+    def __init__(self) -> None:
+        self.now_s = 1000.0
+
+    def monotonic(self) -> float:
+        return self.now_s
+
+    def sleep(self, seconds: float) -> None:
+        self.now_s += seconds
+
+
+class SimulatedThread(PolicyThread):
+    """Infers where it is asked; the answer comes when the simulated latency is over."""
+
+    def ask(self, question: Mapping[str, Any]) -> None:
+        self.busy = True
+        self._answer(question)
+        policy = getattr(self._infer, "__self__", None)
+        self._due_s = process.time.monotonic() + getattr(policy, "latency_s", 0.0)
+
+    def take(self) -> Mapping[str, Any] | None:
+        return (
+            super().take() if self.busy and process.time.monotonic() >= self._due_s - 1e-9 else None
+        )
+
+
+@pytest.fixture
+def simulated_time(monkeypatch: pytest.MonkeyPatch) -> SimulatedTime:
+    """The clock of `run_robot`, so that a busy machine changes nothing: only sleeping moves it, and
+    an answer comes when the policy's `latency_s` is over."""
+    simulated = SimulatedTime()
+    for module in ("realtime", "readings", "process", "run_report"):
+        monkeypatch.setattr(f"pipeline.robot.{module}.time", simulated)
+    monkeypatch.setattr("pipeline.robot.realtime.PolicyThread", SimulatedThread)
+    monkeypatch.setattr(gc, "collect", lambda: 0)  # a third of a second each, for nothing here
+    return simulated
 
 
 @pytest.fixture

@@ -4,6 +4,7 @@ import importlib.util
 import json
 import threading
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from types import MethodType
 from typing import Any
@@ -292,24 +293,26 @@ class Filming(Follower):
 
 
 @pytest.fixture
-def example(monkeypatch: pytest.MonkeyPatch) -> Any:
+def example(monkeypatch: pytest.MonkeyPatch, simulated_time: Any) -> Any:
     spec = importlib.util.spec_from_file_location("lerobot_arm_example", EXAMPLE)
     assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     monkeypatch.setattr(module, "PolicyClient", Policy)
+    arm = partial(LeRobotArm, clock_s=simulated_time.monotonic)
+    monkeypatch.setattr(module, "LeRobotArm", arm)
     monkeypatch.setattr(module, "CAMERAS", {"View1": "front"})
     return module
 
 
 def test_the_example_drives_a_robot_and_records_it(example: Any, tmp_path: Path) -> None:
     robot = Filming()
-    example.drive(robot, RunSettings("Push", seconds=1.0, missed_in_a_row=1000), tmp_path)
+    example.drive(robot, RunSettings("Push", seconds=1.0), tmp_path)
     (root,) = tmp_path.iterdir()
     (recording,) = open_recordings([Source(name="runs", path=str(root))], tmp_path).recordings
     action, state = recording.action(), recording.state()
     assert action is not None and state is not None and action.kind == "absolute"
-    assert len(action.time) == len(robot.sent) - 1 > 5, "all but the stop"
+    assert len(action.time) == len(robot.sent) - 1 == 49, "all but the stop"
     wanted = np.tile(np.arange(6, dtype=np.float32) + np.float32(0.01), (len(action.time), 1))
     np.testing.assert_array_equal(action.values, wanted)
     assert robot.sent[-1] == robot.place
@@ -324,7 +327,7 @@ def test_the_example_keeps_its_limits(
     """Too large a step stops the robot before it moves; too fast a one is made slower."""
     monkeypatch.setattr(Policy, "far", far)
     robot = Filming()
-    settings = RunSettings("Push", seconds=0.3, missed_in_a_row=1000)
+    settings = RunSettings("Push", seconds=0.3)
     example.drive(robot, settings, tmp_path)
     assert robot.sent[0]["shoulder_lift.pos"] <= most + 0.01
     assert (len(robot.sent) == 1) == (far == 90.0)
@@ -335,7 +338,7 @@ def test_the_example_keeps_the_run_that_a_first_action_beyond_a_limit_stops(
 ) -> None:
     monkeypatch.setattr(Policy, "far", 90.0)
     robot = Filming()
-    example.drive(robot, RunSettings("Push", seconds=5.0, missed_in_a_row=1000), tmp_path)
+    example.drive(robot, RunSettings("Push", seconds=5.0), tmp_path)
     assert len(robot.sent) == 1, "the stop alone"
     root = tmp_path / "run_000000"
     printed = capsys.readouterr().out.rstrip()

@@ -1,5 +1,8 @@
-"""Features asked live are those that the store holds, and another model's are refused."""
+"""Live features are those of the store; another model is refused with the reason."""
 
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,10 +14,16 @@ from safetensors.torch import load_file, save_file
 from pipeline.base.config import Params
 from pipeline.base.errors import CheckpointMismatch
 from pipeline.data import open_recordings
-from pipeline.robot.live_features import LiveFeatures
+from pipeline.policy.checkpoint import PolicyCheckpoint
+from pipeline.robot.live_features import LiveFeatures, prove
 from pipeline.store import FeatureStore
 from pipeline.vlm.demo_checkpoint import write_demo_checkpoint
+from pipeline.vlm.deviation import TOLERANCES
 from pipeline.vlm.live import LiveVLM
+from pipeline.vlm.preparation import Preparer
+from pipeline.vlm.processor import PromptRenderer
+
+Frames = Mapping[str, np.ndarray]
 
 
 def test_live_features_are_the_stored_ones(params: Params) -> None:
@@ -82,3 +91,133 @@ def test_the_key_of_frames_is_that_of_the_policys_store(params: Params) -> None:
     live = LiveFeatures(params.vlm, store.spec, "cpu")
     for row in store.golden:
         assert live.key(row.frames, row.instruction) == row.key
+
+
+@pytest.fixture
+def live(params: Params, checkpoint: PolicyCheckpoint) -> LiveFeatures:
+    return LiveFeatures(params.vlm, checkpoint.source["feature_spec"], "cpu")
+
+
+def refusal(checkpoint: PolicyCheckpoint, live: LiveFeatures) -> str:
+    with pytest.raises(CheckpointMismatch) as refused:
+        prove(checkpoint, live, print)
+    return str(refused.value)
+
+
+def broken(monkeypatch: pytest.MonkeyPatch, change: Callable[[Frames], Frames]) -> None:
+    """Frames are prepared otherwise than at extraction."""
+    real = Preparer.prepare
+    monkeypatch.setattr(
+        Preparer, "prepare", lambda self, told, frames: real(self, told, change(frames))
+    )
+
+
+def proven(checkpoint: PolicyCheckpoint, live: LiveFeatures) -> tuple[int, float, float]:
+    """Of the only line that is said: the rows, the largest deviation and the tolerance."""
+    said: list[str] = []
+    prove(checkpoint, live, said.append)
+    (line,) = said
+    found = re.fullmatch(
+        r"(\d+) golden rows computed again: the largest deviation is (\S+) of a slot's root mean "
+        r"square \(layer .+\), (\S+) is tolerated",
+        line,
+    )
+    assert found, line
+    return int(found[1]), float(found[2]), float(found[3])
+
+
+class TestProven:
+    def test_the_very_model(self, checkpoint, live):
+        rows, largest, tolerance = proven(checkpoint, live)
+        assert rows == len(checkpoint.golden) == 4
+        assert tolerance == TOLERANCES["float32"]
+        assert 0 <= largest < 1e-5
+
+    def test_another_attention_backend(self, checkpoint, params):
+        vlm = params.vlm.model_copy(update={"attention": "eager"})
+        live = LiveFeatures(vlm, checkpoint.source["feature_spec"], "cpu")
+        assert 0 < proven(checkpoint, live)[1] < TOLERANCES["float32"] / 10
+
+    def test_without_golden_rows_there_is_a_warning(self, checkpoint, live):
+        said: list[str] = []
+        prove(replace(checkpoint, golden=()), live, said.append)
+        (warning,) = said
+        assert warning.startswith("WARNING: this checkpoint carries no golden rows")
+
+
+class TestRefused:
+    def test_weights_altered_without_the_spec_noticing(self, checkpoint, live):
+        with torch.no_grad():
+            for weights in live._model.model.language_model.layers[2].mlp.parameters():
+                weights.mul_(1.05)
+        said = refusal(checkpoint, live)
+        assert "4 of 4 golden rows are not the features that the policy was trained on" in said
+        assert "slots deviate by more than 1e-03 of their root mean square" in said
+        assert "layer 3 mean " in said or "layer 3 grid View" in said
+        assert "and 43 more" in said
+        assert "The feature specs agree in every entry" in said
+
+    def test_a_model_that_gives_no_numbers(self, checkpoint, live):
+        with torch.no_grad():
+            next(live._model.model.language_model.layers[1].parameters()).fill_(torch.nan)
+        assert "layer 3 mean nan" in refusal(checkpoint, live)
+
+    def test_red_and_blue_exchanged_on_the_way_to_the_model(self, checkpoint, live, monkeypatch):
+        broken(monkeypatch, lambda frames: {v: f[..., ::-1] for v, f in frames.items()})
+        assert "golden rows are not" in refusal(checkpoint, live)
+
+    def test_views_exchanged_on_the_way_to_the_model(self, checkpoint, live, monkeypatch):
+        broken(monkeypatch, lambda f: {**f, "View1": f["View2"], "View2": f["View1"]} if f else f)
+        said = refusal(checkpoint, live)
+        assert "grid View1" in said or "grid View2" in said
+
+    def test_another_resize_on_the_way_to_the_model(self, checkpoint, live, monkeypatch):
+        broken(
+            monkeypatch,
+            lambda frames: {v: f[::2, ::2].repeat(2, 0).repeat(2, 1) for v, f in frames.items()},
+        )
+        assert "golden rows are not" in refusal(checkpoint, live)
+
+    def test_a_view_that_is_lost_on_the_way_to_the_model(self, checkpoint, live, monkeypatch):
+        broken(monkeypatch, lambda frames: {v: f for v, f in frames.items() if v != "View5"})
+        assert "grid View5 0,0 is missing in one of both" in refusal(checkpoint, live)
+
+    def test_another_rendering_of_the_prompt_is_shown_beside_that_of_training(
+        self, checkpoint, params, monkeypatch
+    ):
+        real, told = PromptRenderer.render, checkpoint.golden[0].instruction
+
+        def render(self: PromptRenderer, instruction: str, views: int) -> str:
+            marked = f"{instruction}!" if instruction == told else instruction  # no example of it
+            return real(self, marked, views)
+
+        monkeypatch.setattr(PromptRenderer, "render", render)
+        live = LiveFeatures(params.vlm, checkpoint.source["feature_spec"], "cpu")
+        said = refusal(checkpoint, live)
+        assert said.startswith("4 of 4 golden rows")
+        trained, now = (line for line in said.splitlines() if line.startswith("prompt, "))
+        assert f"{told}!" not in trained
+        assert f"{told}!" in now
+
+    def test_what_differs_in_the_spec_is_named(self, checkpoint, live):
+        other = {**checkpoint.source["feature_spec"], "tokenizer": "0123", "digest": "other"}
+        source = {**checkpoint.source, "feature_spec": other}
+        rows = tuple(replace(row, features=row.features + 1) for row in checkpoint.golden)
+        said = refusal(replace(checkpoint, source=source, golden=rows), live)
+        assert 'feature spec, tokenizer: "0123" -> ' in said
+
+
+def test_half_precision_tolerates_its_own_noise_and_no_more(
+    params: Params, checkpoint: PolicyCheckpoint, live: LiveFeatures
+) -> None:
+    spec = {**checkpoint.source["feature_spec"], "storage_dtype": "float16"}
+    stored = replace(checkpoint, source={**checkpoint.source, "feature_spec": spec})
+
+    def rounded(by: float) -> Any:
+        return tuple(
+            replace(row, features=(row.features * by).astype(np.float16).astype(np.float32))
+            for row in stored.golden
+        )
+
+    assert proven(replace(stored, golden=rounded(1.0)), live)[2] == 5e-2
+    assert "golden rows are not" in refusal(replace(stored, golden=rounded(1.3)), live)

@@ -24,7 +24,6 @@ from pipeline.base.config import LimitsFile
 from pipeline.base.errors import ConfigError, RecordingError, ServerBusy
 from pipeline.robot.limits import Limits
 from pipeline.robot.loop import StopKind
-from pipeline.robot.process import PolicyThread
 from pipeline.robot.realtime import RunSettings, run_robot
 from pipeline.robot.run_report import RunReport
 
@@ -50,40 +49,9 @@ CALM = RunSettings("Go there", seconds=0.3, hung_s=5)
 Observed = dict[str, Any]
 
 
-class SimulatedTime:
-    """A clock that only sleeping moves."""
-
-    def __init__(self) -> None:
-        self.now_s = 1000.0
-
-    def monotonic(self) -> float:
-        return self.now_s
-
-    def sleep(self, seconds: float) -> None:
-        self.now_s += seconds
-
-
-class SimulatedThread(PolicyThread):
-    """Infers where it is asked; the answer comes when the simulated latency is over."""
-
-    def ask(self, question: Mapping[str, Any]) -> None:
-        self.busy = True
-        self._answer(question)
-        brain: Any = self._infer
-        self._due_s = time.monotonic() + brain.__self__.latency_s
-
-    def take(self) -> Mapping[str, Any] | None:
-        return super().take() if self.busy and time.monotonic() >= self._due_s - 1e-9 else None
-
-
 @pytest.fixture(autouse=True)
-def simulated_time(monkeypatch: pytest.MonkeyPatch) -> None:
-    simulated = SimulatedTime()
-    for module in ("realtime", "readings", "process", "run_report"):
-        monkeypatch.setattr(f"pipeline.robot.{module}.time", simulated)
-    monkeypatch.setattr("pipeline.robot.realtime.PolicyThread", SimulatedThread)
-    monkeypatch.setattr(sys.modules[__name__], "time", simulated)
-    monkeypatch.setattr(gc, "collect", lambda: 0)  # a third of a second each, for nothing here
+def simulated_time(simulated_time: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys.modules[__name__], "time", simulated_time)
 
 
 class Arm:

@@ -277,7 +277,7 @@ def test_a_part_that_took_no_time_is_not_counted(served_policy: Served) -> None:
     status = ServerStatus(served_policy().metadata)
     for ms in range(1, 1001):
         status.answered({"vlm_ms": 0.0, "head_ms": ms, "wait_ms": 0.0, "infer_ms": 2 * ms})
-    latency = json.loads(status.json(0))["latency"]
+    latency = json.loads(status.json())["latency"]
     assert set(latency) == {"head_ms", "infer_ms"}
     assert latency["head_ms"]["count"] == 1000
     assert latency["infer_ms"]["p99"] == pytest.approx(1980.02)
@@ -341,3 +341,24 @@ def test_an_address_that_is_taken_or_somebody_elses_is_refused() -> None:
         listen(params(host="192.0.2.1"))
     with pytest.raises(ConfigError, match=r"serve\.port: no\.such\.invalid"):
         listen(params(host="no.such.invalid"))
+
+
+def test_a_robot_counts_until_its_observation_is_answered_though_it_has_left(
+    served_policy: Served, serving: Serving, observe: Observe
+) -> None:
+    """Or a stranger who comes and goes would fill the memory with observations that wait."""
+    served = served_policy()
+    looking, go = threading.Event(), threading.Event()
+
+    def wait() -> None:
+        looking.set()
+        assert go.wait(60)
+
+    served.glance.before = wait
+    server = serving(served, max_connections=1)
+    with opened(server) as bare:
+        bare.send(wire.pack(observe(0)))
+        assert looking.wait(60)
+    with pytest.raises(ConnectionError, match="busy: 1 robots"):
+        client_of(server)
+    go.set()
