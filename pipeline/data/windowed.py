@@ -30,8 +30,7 @@ from pipeline.data.windows import rebuild
 MARKER = "metadata.json"
 _SENSOR_FILE = "sensor_data.npz"
 _LEFT_WITHOUT = frozenset({_SENSOR_FILE, "robot_states.npz"})
-"""An episode that lost its metadata.json is reported, not passed over."""
-
+"""Files by which an episode that lost its metadata.json is reported, not passed over."""
 
 _Count = Annotated[int, Field(ge=0, le=10**9)]
 
@@ -72,8 +71,8 @@ class WindowedRecording(InsertionRecording):
         path = robot_state_file(self.path)
         if path is None:
             return None
-        told = self._metadata
-        times = (told.start_time, told.robot_hz, told.end_time)
+        metadata = self._metadata
+        times = (metadata.start_time, metadata.robot_hz, metadata.end_time)
         stream = read_robot_states(path, self._overrides.limits, *times)
         self._check_count("robot_states_count", len(stream.time), path)
         return stream
@@ -106,38 +105,35 @@ class WindowedRecording(InsertionRecording):
         return [view for view in list_empty_views(self.path / "images") if self._wants(view)]
 
     def nominal(self) -> Nominal:
-        told = self._metadata
-        rates = {"sensor": told.sensor_hz, "state": told.robot_hz}
-        return Nominal(
-            rates_hz={name: rate for name, rate in rates.items() if rate is not None},
-            streams=promised(
-                told,
-                sensor=("sensor_windows_count", "sensor_hz"),
-                state=("robot_states_count", "robot_hz"),
-            ),
-            where=MARKER,
+        rates = {"sensor": self._metadata.sensor_hz, "state": self._metadata.robot_hz}
+        known = {name: rate for name, rate in rates.items() if rate is not None}
+        streams = promised(
+            self._metadata,
+            sensor=("sensor_windows_count", "sensor_hz"),
+            state=("robot_states_count", "robot_hz"),
         )
+        return Nominal(known, streams, MARKER)
 
     def _recorded_instruction(self) -> str:
         return self._metadata.instruction or super()._recorded_instruction()
 
     def _check_count(self, key: str, rows: int, path: Path) -> None:
-        said = getattr(self._metadata, key)
-        if said not in (None, rows):
+        count = getattr(self._metadata, key)
+        if count not in (None, rows):
             raise RecordingError(
-                f"{path}: {rows} rows, but {key} in {self._metadata_file} says {said}; "
+                f"{path}: {rows} rows, but {key} in {self._metadata_file} says {count}; "
                 "they must agree: copy the episode again, or correct the metadata"
             )
 
     def _view_files(self) -> Mapping[str, list[Path]]:
-        views, told = list_views(self.path / "images"), self._metadata
+        views, metadata = list_views(self.path / "images"), self._metadata
         there = {split_eye(view)[0] for view in views}
-        promised = {split_eye(view)[0] for view in told.camera_views or () if self._wants(view)}
+        listed = {split_eye(view)[0] for view in metadata.camera_views or () if self._wants(view)}
         most = max(map(len, views.values()), default=0)
-        if lost := sorted(promised - there):
+        if lost := sorted(listed - there):
             what = f"camera_views has {', '.join(lost)}, and images/ no frame of it"
-        elif self._views is None and most < (told.camera_frames_count or 0):
-            what = f"camera_frames_count is {told.camera_frames_count}, and images/ has {most}"
+        elif self._views is None and most < (metadata.camera_frames_count or 0):
+            what = f"camera_frames_count is {metadata.camera_frames_count}, and images/ has {most}"
         else:
             return views
         raise RecordingError(
