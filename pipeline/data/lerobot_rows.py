@@ -54,7 +54,7 @@ class ParquetRows:
         return self.table.path
 
     def columns(self, wanted: Sequence[str]) -> pa.Table:
-        """Those wanted columns that the file has, (row,) each, of numbers or lists of them."""
+        """The wanted columns that the file has, (row,) each, of numbers or lists of them."""
         groups, offset = self.table.groups(self.start, self.stop)
         rows = self.table.numbers(wanted, groups).slice(self.start - offset, self.stop - self.start)
         if rows.num_columns and rows.num_rows != self.stop - self.start:

@@ -61,8 +61,8 @@ def write_v21(
     lengths: list[int] = []
     statistics: list[dict[str, Any]] = []
     described: dict[str, dict[str, Any]] = {}
-    for index, (given, frames) in enumerate(episodes):
-        columns = _numbered(given, index, sum(lengths))
+    for index, (own, frames) in enumerate(episodes):
+        columns = _numbered(own, index, sum(lengths))
         place = {"episode_chunk": 0, "episode_index": index}
         data = root / _DATA["v2.1"].format(**place)
         data.parent.mkdir(parents=True, exist_ok=True)
@@ -74,10 +74,11 @@ def write_v21(
         cameras = {key: _video_feature(film, fps) for key, film in frames.items()}
         described = _described(columns, cameras, features)
     (root / "meta").mkdir()
-    told = {"tasks": [task]}
     for name, rows in {
         "tasks": [{"task_index": 0, "task": task}],
-        "episodes": [{"episode_index": i, **told, "length": n} for i, n in enumerate(lengths)],
+        "episodes": [
+            {"episode_index": i, "tasks": [task], "length": n} for i, n in enumerate(lengths)
+        ],
         "episodes_stats": [{"episode_index": i, "stats": s} for i, s in enumerate(statistics)],
     }.items():
         lines = "".join(json.dumps(row) + "\n" for row in rows)
@@ -113,8 +114,8 @@ def write_v30(
     column = {"name": "task", "field_name": "task"}
     column |= {"pandas_type": "unicode", "numpy_type": "object"}
     index = {"index_columns": ["task"], "columns": [column], "column_indexes": []}
-    told = {"pandas": json.dumps(index)}
-    tasks = pa.table({"task_index": [0], "task": [task]}, metadata=told)
+    pandas = {"pandas": json.dumps(index)}
+    tasks = pa.table({"task_index": [0], "task": [task]}, metadata=pandas)
     pq.write_table(tasks, root / "meta" / "tasks.parquet")
     cameras = {key: {"dtype": "image", "names": ["height", "width", "channel"]} for key in images}
     _write_info(root, "v3.0", [rows], _described(columns, cameras, features), fps)
