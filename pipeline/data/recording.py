@@ -246,20 +246,22 @@ def checked_stream(
     return Stream(channels, time, values)
 
 
-def check_clock(time: NDArray[np.float64], where: str) -> None:
+def check_clock(time: NDArray[np.float64], where: str, rising: bool = False) -> None:
     """Raise `RecordingError` where a clock is not finite, farther from zero than any clock, or goes
-    backwards."""
+    backwards; where it has to be `rising`, also where it stands still."""
     far = np.flatnonzero(~(np.abs(time) <= FARTHEST_S))
     if far.size:
         raise RECORDINGS.refusal(
             where, f"timestamp {time[far[0]]} in row {far[0]}, expected seconds"
         )
-    backwards = np.flatnonzero(np.diff(time) < 0)
-    if backwards.size:
-        row = int(backwards[0]) + 1
+    steps = np.diff(time)
+    wrong = np.flatnonzero(steps <= 0 if rising else steps < 0)
+    if wrong.size:
+        row = int(wrong[0]) + 1
+        course = "goes backwards" if steps[wrong[0]] < 0 else "stands still"
         raise RecordingError(
-            f"{where}: the clock goes backwards at row {row}: "
-            f"{time[row]:.6f} s after {time[row - 1]:.6f} s"
+            f"{where}: the clock {course} at row {row}: {time[row]:.6f} s after "
+            f"{time[row - 1]:.6f} s{'; it must rise from row to row' * rising}"
         )
 
 
@@ -278,18 +280,6 @@ def check_resolution(stored: NDArray[Any], where: str) -> None:
             f"{where}: times of {stored.dtype} near {time[-1]:.0f} s go by steps of {step:g} s, "
             f"too coarse for {len(time)} of them in {time[-1] - time[0]:g} s; expected float64, "
             "not rounded. Export the recording again with such times, or leave it out"
-        )
-
-
-def check_rising_clock(time: NDArray[np.float64], where: str) -> None:
-    """Raise `RecordingError` where a clock is not finite, goes backwards or stands still."""
-    check_clock(time, where)
-    still = np.flatnonzero(np.diff(time) == 0)
-    if still.size:
-        row = int(still[0]) + 1
-        raise RecordingError(
-            f"{where}: the clock stands still at row {row}: "
-            f"{time[row]:.6f} s after {time[row - 1]:.6f} s; it must rise from row to row"
         )
 
 
