@@ -23,7 +23,15 @@ from pipeline.base.config import MediaLimits, Source
 from pipeline.base.errors import RecordingError
 from pipeline.data.arrays import MOST_CHANNELS, member, read_npz
 from pipeline.data.insertion import SENSOR
-from pipeline.data.lerobot_meta import MARKER, META, Entry, LeRobotMeta, Vector, read_meta
+from pipeline.data.lerobot_meta import (
+    MARKER,
+    META,
+    Entry,
+    LeRobotMeta,
+    Vector,
+    read_meta,
+    sidecar,
+)
 from pipeline.data.lerobot_rows import (
     CLOCK,
     FRAME,
@@ -284,8 +292,7 @@ class LeRobotRecording(Recording):
 
     def _sidecar(self, name: str) -> Path | None:
         """The episode's file of that name, where there is one."""
-        # Not `self.id`, before which parent folders may stand.
-        path = self.path / name / f"{self._entry.id}.npz"
+        path = sidecar(self.path, name, self._entry.index)
         return path if os.path.lexists(path) else None
 
 

@@ -61,6 +61,11 @@ def _flat_names(names: Any) -> Any:
     return tuple(name for part in lists for name in part)
 
 
+def sidecar(root: Path, name: str, index: int = 0) -> Path:
+    """This project's file beside a data set of that name, for an episode; there or not."""
+    return root / name / f"episode_{index:06d}.npz"
+
+
 class _VideoInfo(Document):
     depth: Annotated[bool | None, Strict(False)] = Field(default=None, alias="is_depth_map")
     video_depth: Annotated[bool | None, Strict(False)] = Field(

@@ -18,7 +18,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from pipeline.data.lerobot_meta import MARKER
+from pipeline.data.lerobot_meta import MARKER, sidecar
 
 Columns = Mapping[str, NDArray[Any]]
 """By feature key: (row,) or (row, channel), `timestamp` (s since the first row) among them."""
@@ -119,11 +119,6 @@ def write_v30(
     pq.write_table(tasks, root / "meta" / "tasks.parquet")
     cameras = {key: {"dtype": "image", "names": ["height", "width", "channel"]} for key in images}
     _write_info(root, "v3.0", [rows], _described(columns, cameras, features), fps)
-
-
-def sidecar(root: Path, name: str, index: int = 0) -> Path:
-    """Where an episode's file of what LeRobot has no place for lies, by its kind."""
-    return root / name / f"episode_{index:06d}.npz"
 
 
 def write_sidecar(
