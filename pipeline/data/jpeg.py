@@ -27,7 +27,7 @@ Frame = TypeVar("Frame")
 Seen = TypeVar("Seen")
 _EYES = ("left", "right")
 _SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".gif", ".tif", ".tiff", ".webp")
-"""Of images; those that are not decoded are refused by name."""
+"""Suffixes of images; files that are not decoded are refused by name."""
 _PADDED = re.compile(r"0\d+")
 """A number in place of a time: 000001."""
 _VIEW = re.compile(r"view(?=\d)", re.IGNORECASE)

@@ -23,7 +23,7 @@ from pipeline.data.lerobot_meta import MARKER, sidecar
 Columns = Mapping[str, NDArray[Any]]
 """By feature key: (row,) or (row, channel), `timestamp` (s since the first row) among them."""
 Features = Mapping[str, Mapping[str, Any]]
-"""What `info.json` says of features beside their type and shape."""
+"""By feature key: entries of `info.json` beside type and shape."""
 
 _DATA: Final = {
     "v2.1": "data/chunk-{episode_chunk:03d}/episode_{episode_index:06d}.parquet",
@@ -34,7 +34,7 @@ _NUMBERING: Final = ("timestamp", "frame_index", "episode_index", "index", "task
 _STATISTICS_EVERY: Final = 10
 """Frames between those that image statistics are taken from."""
 _IMAGES_A_GROUP: Final = 64
-"""Of the parquet file's rows: equal images are stored once a group, which is held in memory."""
+"""Images in a row group: equal images are stored once a group, which is held in memory."""
 _DICTIONARY_BYTES: Final = 2**30
 _FIRST: Final = {"chunk_index": 0, "file_index": 0}
 _IMAGE: Final = pa.struct(

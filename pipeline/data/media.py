@@ -20,15 +20,15 @@ from pipeline.base.errors import RecordingError
 
 RECORDINGS = Border(RecordingError, "Copy the file again, or leave the episode out.")
 INTACT = Border(RecordingError, "Write the file again as expected, or leave the episode out.")
-"""Of a file that is whole: a copy would be refused, too."""
+"""Refuses a file that is whole: a copy would be refused, too."""
 
 DEFAULT_LIMITS = MediaLimits()
-"""Of a file that belongs to no source."""
+"""Limits of a file that belongs to no source."""
 FARTHEST_S = 1e20
 """No clock is farther from zero: nanoseconds since 1970 are 1e18."""
 Seconds = Annotated[float, Field(ge=-FARTHEST_S, le=FARTHEST_S)]
 Rate = Annotated[float, Field(ge=1e-3, le=1e6)]
-"""Of a stream, in Hz."""
+"""Rate of a stream, in Hz."""
 
 _ALWAYS_TAKEN = 256 * 2**20
 """Unpacked bytes that no ratio forbids: a constant stream packs a thousandfold."""
@@ -63,7 +63,7 @@ class Grouped(Document):
 
 
 def check_unpacked(where: Path | str, unpacked: int, packed: int, limits: MediaLimits) -> None:
-    """Refuse an array or a table of so many bytes in so many bytes of a file, before it is read."""
+    """Refuse an array or a table by its bytes, unpacked and in the file, before it is read."""
     ratio = max(_ALWAYS_TAKEN, int(limits.ratio * packed))
     for most, name in ((limits.array_bytes, "array_bytes"), (ratio, "ratio")):
         check_limit(where, unpacked, most, name, "bytes unpacked")

@@ -92,7 +92,7 @@ class ParquetTable:
         return range(first, last + 1), int(ends[first] - counts[first])
 
     def _stamp(self) -> int:
-        """What changes when the file does."""
+        """A number that changes when the file does."""
         RECORDINGS.check_file(self.path)
         return self.path.stat().st_mtime_ns
 

@@ -29,7 +29,7 @@ from pipeline.base.finite import first_non_finite, non_finite
 from pipeline.data.media import FARTHEST_S, RECORDINGS
 
 _MOST_BYTES = 2**38
-"""Of a file of an episode: a larger one is refused unread."""
+"""Largest size of a file of an episode; a larger one is refused unread."""
 ActionKind = Literal["absolute", "velocity", "delta"]
 
 
@@ -124,7 +124,7 @@ class Recording(ABC):
     path: Path
 
     def __init__(self, path: Path, source: Source, views: Sequence[str] | None) -> None:
-        """Of the views, only those in `views` are kept; all of them where it is None."""
+        """Only the views in `views` are kept; all of them where it is None."""
         self.path = path
         self.id = path.name
         self.source = source.name
@@ -302,7 +302,7 @@ def content_digest(recording: Recording, digest_of: Callable[[Path], str]) -> st
 
 
 def entries(folder: Path) -> list[os.DirEntry[str]]:
-    """What is in a folder; `RecordingError` where it cannot be listed."""
+    """The entries of a folder; `RecordingError` where it cannot be listed."""
     with RECORDINGS.foreign(folder, "cannot be listed"), os.scandir(folder) as listed:
         return list(listed)
 

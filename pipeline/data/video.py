@@ -43,7 +43,7 @@ class _FrameTable(NamedTuple):
 
     pts: NDArray[np.int64]
     key_pts: NDArray[np.int64]
-    """Of the key frame from which decoding has to start."""
+    """The key frame from which decoding has to start."""
     key_dts: NDArray[np.int64]
 
 
@@ -103,7 +103,7 @@ class VideoClip(CameraStream):
                 yield frame
 
     def _decode_until(self, decoded: Iterator[VideoFrame], index: int, twins: int) -> VideoFrame:
-        """The frame, after so many others of the same time."""
+        """The frame that follows `twins` others of the same time."""
         pts, key_pts, reason = int(self._table.pts[index]), int(self._table.key_pts[index]), ""
         try:
             for frame in decoded:

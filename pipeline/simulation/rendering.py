@@ -24,10 +24,10 @@ WIDTH: Final = 224
 HEIGHT: Final = 126
 
 JPEG_QUALITY: Final = 75
-"""Of the recorder's frames, and so of those that a policy sees."""
+"""JPEG quality of the recorder's frames, which a policy sees."""
 
 _NOISE = 2.0
-"""Of every level of a pixel."""
+"""Standard deviation of the noise of a pixel's level."""
 _OVERSAMPLING = 2
 _SIZE = np.array([WIDTH, HEIGHT]) * _OVERSAMPLING
 _MIDDLE = _SIZE / 2
@@ -41,7 +41,7 @@ _STICKER_MM, _MARK_MM = 3.6, 2.8
 _HUB_RADIUS_MM, _SHAFT_MM, _ARM_MM = 1.25, 0.55, 0.6
 _GUARD_TOP = 0.85
 _ACROSS: Final = np.array([1.0, 1.0]) / np.sqrt(2.0)
-"""What the side camera shows to the right, in x and y of the bench."""
+"""The direction to the right in the side camera's image, in x and y of the bench."""
 
 _BENCH, _WALL, _GUARD = (96, 104, 112), (206, 212, 216), (58, 62, 68)
 _SKIN, _SKIN_EDGE = (232, 190, 168), (196, 146, 124)
