@@ -1,7 +1,7 @@
-"""Files on disk -> `Recording`: one entry for every format, numpy only.
+"""Files on disk -> `Recording`, for every format; numpy only.
 
 `open_recordings` finds the episodes of the params' sources and reads metadata only; streams and
-frames are read when asked for.
+frames are read on demand.
 """
 
 from collections import Counter
@@ -51,11 +51,11 @@ class BadEpisode:
 
 @dataclass(frozen=True)
 class Opened:
-    """What the sources hold, in the order of the sources and then in natural order of paths."""
+    """The episodes of all sources, in the order of the sources, then in natural order of paths."""
 
     recordings: tuple[Recording, ...]
     missing: tuple[str, ...]
-    """Lines for people: episodes that `meta/` lists and whose files are not there."""
+    """A line for each episode that a LeRobot `meta/` lists and whose files are not there."""
     bad: tuple[BadEpisode, ...]
 
 
@@ -76,19 +76,19 @@ def open_recordings(
         of_source: list[Recording] = []
         for folder, reader in episode_folders(source, root):
             try:
-                found, absent = reader.open(folder, source, views)
+                episodes, absent = reader.open(folder, source, views)
             except RecordingError as error:
                 if reader is READERS["lerobot"]:
                     raise RecordingError(f"source {source.name!r}: {error}") from None
                 bad.append(BadEpisode(source.name, folder, str(error)))
                 continue
-            if not found:
+            if not episodes:
                 raise RecordingError(
                     f"source {source.name!r}: {folder} has none of the {len(absent)} episode(s) "
                     f"that its meta/ lists{'; first: ' + absent[0].rstrip('.') if absent else ''}. "
                     "Copy the data and video files too, or correct the paths in meta/info.json."
                 )
-            of_source += found
+            of_source += episodes
             missing += absent
         _name_apart(of_source)
         recordings += of_source
@@ -100,23 +100,24 @@ def open_recordings(
 def open_recording(
     path: Path, format: str, id: str, views: Sequence[str] | None = None
 ) -> Recording:
-    """The episode that a store calls by these, alone; only the views in `views` are kept.
+    """The one episode that a store names so; only the views in `views` are kept.
 
     Raises `RecordingError` where it is not there, or not of that format any more.
     """
     reader, source = READERS[format], Source(name=format, path=str(path))
     if not reader.marks(path, listing(path)):
         raise RecordingError(f"{path}: not of the format {format} (no {reader.marker})")
-    found, _ = reader.open(path, source, views)
-    # Parent folders stand before the ids that stood more than once in a source.
-    of_id = [one for one in found if format != "lerobot" or one.id == id.rpartition("/")[2]]
-    if not of_id:
-        raise RecordingError(f"{path}: has no episode {id}")
-    return of_id[0]
+    episodes, _ = reader.open(path, source, views)
+    # Parent folders stand before an id that occurred more than once in its source.
+    name = id.rpartition("/")[2]
+    for episode in episodes:
+        if format != "lerobot" or episode.id == name:
+            return episode
+    raise RecordingError(f"{path}: has no episode {id}")
 
 
 def _name_apart(recordings: Sequence[Recording]) -> None:
-    """Put parent folders before the ids that stand more than once in a source."""
+    """Put parent folders before ids that occur more than once in a source."""
     parts = [
         (*absolute(r.path).parts[1:], r.id) if r.format == "lerobot" else absolute(r.path).parts[1:]
         for r in recordings
@@ -135,7 +136,10 @@ def _name_apart(recordings: Sequence[Recording]) -> None:
 
 
 def _check_views(recordings: Sequence[Recording], views: Sequence[str]) -> None:
-    """Stops at the first recordings that have the views, and opens pickles last."""
+    """Raise `RecordingError` where no recording has a wanted view.
+
+    Recordings are asked until all views were seen, pickles last.
+    """
     there: set[str] = set()
     for recording in sorted(recordings, key=lambda r: r.format == "old"):
         if there.issuperset(views):
@@ -143,7 +147,7 @@ def _check_views(recordings: Sequence[Recording], views: Sequence[str]) -> None:
         try:
             there.update(recording.all_views())
         except RecordingError:
-            continue  # is reported where this episode is read
+            continue  # reported where the episode is read
     unknown = [view for view in views if view not in there]
     if unknown:
         raise RecordingError(

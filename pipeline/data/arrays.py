@@ -31,10 +31,11 @@ def read_npz(
     text: Collection[str] = (),
     limits: MediaLimits = DEFAULT_LIMITS,
 ) -> dict[str, NDArray[Any]]:
-    """Those members of a .npz that are wanted and there; those in `text` hold words.
+    """The members of a .npz that are `wanted`, of numbers, or in `text`, of words.
 
-    Raises `RecordingError` naming file and member where it is truncated, damaged, larger than the
-    limits, or holds something else than numbers; object arrays are refused unread.
+    A member that is not there is left out, but one of them has to be. Raises `RecordingError`
+    naming file and member where it is truncated, damaged, larger than the limits, or of another
+    type; object arrays are refused unread.
     """
     members: dict[str, NDArray[Any]] = {}
     RECORDINGS.check_file(path)
@@ -96,8 +97,8 @@ def member(members: Mapping[str, Numbers], names: Sequence[str], path: Path) -> 
 def numeric(array: Any, where: str) -> Numbers:
     """The array, if it holds rows of real numbers."""
     if not isinstance(array, np.ndarray) or array.dtype.kind not in "fiu":
-        found = getattr(array, "dtype", type(array).__name__)
-        raise RecordingError(f"{where}: expected an array of numbers, found {found}")
+        kind = getattr(array, "dtype", type(array).__name__)
+        raise RecordingError(f"{where}: expected an array of numbers, found {kind}")
     if array.ndim == 0:
         raise RecordingError(f"{where}: expected rows of numbers, found the single {array}")
     return array
@@ -105,9 +106,8 @@ def numeric(array: Any, where: str) -> Numbers:
 
 def _words(array: NDArray[Any], where: str) -> NDArray[Any]:
     if array.dtype.kind != "U" or array.ndim != 1 or len(array) > MOST_CHANNELS:
-        found = f"{array.dtype} of shape {array.shape}"
-        why = f"expected a list of at most {MOST_CHANNELS:,} words, found {found}"
-        raise INTACT.refusal(where, why)
+        why = f"expected a list of at most {MOST_CHANNELS:,} words, found {array.dtype} of shape "
+        raise INTACT.refusal(where, f"{why}{array.shape}")
     return array
 
 

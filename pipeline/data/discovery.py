@@ -1,4 +1,4 @@
-"""Where the episodes of a source lie, and which format they are of."""
+"""Where the episodes of a source lie, and in which format."""
 
 import glob
 import os
@@ -6,7 +6,7 @@ import re
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass
 from fnmatch import filter as matching
-from itertools import islice
+from itertools import chain, islice
 from pathlib import Path
 
 from pipeline.base.border import shown
@@ -16,22 +16,21 @@ from pipeline.base.errors import RecordingError
 from pipeline.data import lerobot, pickled, raw, windowed
 from pipeline.data.recording import Recording, absolute, entries, natural_key
 
-Found = tuple[Sequence[Recording], Sequence[str]]
-"""Episodes, and lines about those that are not there."""
+Opener = Callable[[Path, Source, Sequence[str] | None], tuple[Sequence[Recording], Sequence[str]]]
+"""The episodes of a folder, and lines about those that are not there."""
 
 
 @dataclass(frozen=True)
 class FormatReader:
-    """A format: what marks its folders, and how one is opened."""
+    """How a format's folders are recognised and opened."""
 
     marker: str
     marks: Callable[[Path, Collection[str]], bool]
-    open: Callable[[Path, Source, Sequence[str] | None], Found]
+    open: Opener
 
 
-def _one(
-    episode: Callable[[Path, Source, Sequence[str] | None], Recording],
-) -> Callable[[Path, Source, Sequence[str] | None], Found]:
+def _one(episode: Callable[[Path, Source, Sequence[str] | None], Recording]) -> Opener:
+    """The opener of a format with one episode a folder."""
     return lambda path, source, views: ([episode(path, source, views)], [])
 
 
@@ -52,7 +51,7 @@ _FOREIGN = {
     "*.npz *.npy *.csv *.tsv *.pkl *.pickle *.pt": "arrays or tables of another recorder",
     "*.mp4 *.avi *.mkv *.mov *.webm *.jpg *.jpeg *.png": "images alone, without their actions",
 }
-"""What recordings that no reader knows look like, by names in them; the first that fits decides."""
+"""Formats without a reader, by the names of their files; the first match decides."""
 
 _ON_THE_HUB = (
     "A data set on the Hugging Face hub has to lie here first: hf download --repo-type dataset "
@@ -62,7 +61,7 @@ _ON_THE_HUB = (
 _ODD = re.compile(r"[\x00-\x1f\x7f\ud800-\udfff]")
 """Control characters, and bytes of a name that are not UTF-8."""
 _MOST_LOOKED_AT = 1000
-"""Folders that are searched for what a folder without an episode looks like."""
+"""Folders searched for such names."""
 _DEEPEST = 4
 """Levels below a LeRobot root at which its files lie: videos/chunk-000/view/episode.mp4."""
 
@@ -73,7 +72,7 @@ def episode_folders(source: Source, root: Path) -> list[tuple[Path, FormatReader
     Raises `RecordingError` where a path has none, and where a name is not UTF-8 or holds control
     characters: a store could not keep it.
     """
-    found: dict[Path, tuple[Path, FormatReader]] = {}
+    unique: dict[Path, tuple[Path, FormatReader]] = {}
     for pattern in source.paths:
         full = absolute(root / pattern)
         _check_pattern(source, pattern, full)
@@ -97,27 +96,27 @@ def episode_folders(source: Source, root: Path) -> list[tuple[Path, FormatReader
             )
         for folder, reader in episodes:
             _check_name(source, folder)
-            found.setdefault(folder.resolve(), (folder, reader))
-    return sorted(found.values(), key=lambda pair: natural_key(pair[0]))
+            unique.setdefault(folder.resolve(), (folder, reader))
+    return sorted(unique.values(), key=lambda pair: natural_key(pair[0]))
 
 
 def _matches(full: Path) -> list[Path]:
-    """The folders that a path or glob means; a glob's end `/**` is the search that follows."""
+    """The folders of a path or glob; a final `/**` is left out: all below is searched."""
     if _is_folder(full):
         return [full]
     while full.name == "**":
         full = full.parent
     # glob follows symbolic links, as data folders often are; pathlib's ** does not.
-    found = [Path(match) for match in glob.glob(str(full), recursive=True)]  # noqa: PTH207
-    return sorted(filter(_is_folder, found), key=natural_key)
+    matches = [Path(match) for match in glob.glob(str(full), recursive=True)]  # noqa: PTH207
+    return sorted(filter(_is_folder, matches), key=natural_key)
 
 
 def _is_folder(path: Path) -> bool:
-    return os.path.isdir(path)  # noqa: PTH112, which bears a name that is too long
+    return os.path.isdir(path)  # noqa: PTH112, which accepts a name that is too long
 
 
 def _episodes(start: Path, source: Source) -> Iterator[tuple[Path, FormatReader]]:
-    """Episode folders at or below a folder; nothing is looked for inside an episode."""
+    """Episode folders at or below a folder; episodes themselves are not searched."""
     pending, seen = [start], set[tuple[int, int]]()
     while pending:
         folder = pending.pop()
@@ -130,7 +129,7 @@ def _episodes(start: Path, source: Source) -> Iterator[tuple[Path, FormatReader]
             yield folder, READERS[format]
         else:
             below = (entry for entry in listed if not entry.name.startswith("."))
-            # Which files are folders is known without asking for each.
+            # A listing tells folders from files without a call for each.
             pending += [
                 Path(entry.path)
                 for entry in below
@@ -152,7 +151,7 @@ def _detect(folder: Path, names: Collection[str], source: Source) -> str | None:
 
 
 def meant(path: Path) -> str:
-    """What a path without an episode lies in or looks like, and what to do; '' if unknown."""
+    """A hint about a path without an episode: what it lies in or looks like; '' if unknown."""
     for folder in path.parents[:_DEEPEST]:
         if not (folder.is_dir() and os.access(folder, os.R_OK)):
             continue
@@ -164,7 +163,7 @@ def meant(path: Path) -> str:
 
 
 def _foreign(path: Path) -> str:
-    """What a folder or file that no reader knows looks like, and the way from there; '' if unknown.
+    """The format of a folder or file without a reader, and what to do; '' if unknown.
 
     Zarr v3 groups, as this project's stores are, are passed over.
     """
@@ -175,7 +174,7 @@ def _foreign(path: Path) -> str:
         else:
             names |= {name.lower() for name in (*below, *files)}
     for patterns, what in _FOREIGN.items():
-        fitting = sorted(name for one in patterns.split() for name in matching(names, one))
+        fitting = sorted(chain.from_iterable(matching(names, end) for end in patterns.split()))
         if fitting:
             return (
                 f"It looks like {what} ({fitting[0]}), which this project does not read. Convert "
@@ -208,7 +207,7 @@ def _check_name(source: Source, folder: Path) -> None:
 
 
 def _format(folder: Path, names: Collection[str]) -> str | None:
-    return next((name for name, one in READERS.items() if one.marks(folder, names)), None)
+    return next((name for name, reader in READERS.items() if reader.marks(folder, names)), None)
 
 
 def listing(folder: Path) -> list[str]:

@@ -14,7 +14,7 @@ _NO_CHANNELS = Channels((), ())
 
 @dataclass(frozen=True)
 class Embodiment:
-    """Channels of action, sensor and state; none where a stream is absent."""
+    """Channels of action, sensor and state; no channels where a stream is absent."""
 
     action: Channels
     action_kind: str
@@ -25,9 +25,9 @@ class Embodiment:
     def of(
         cls, action: Channels, action_kind: str, sensor: Stream | None, state: Stream | None
     ) -> "Embodiment":
-        """That of a recording with these streams."""
-        there = {"sensor": sensor, "state": state}
-        channels = {name: one.channels for name, one in there.items() if one is not None}
+        """The embodiment of a recording with these streams."""
+        streams = {"sensor": sensor, "state": state}
+        channels = {name: stream.channels for name, stream in streams.items() if stream is not None}
         return cls(action, action_kind, **channels)
 
     def document(self) -> dict[str, dict[str, Any]]:
@@ -51,7 +51,7 @@ class ReadEpisode:
 
     @property
     def embodiment(self) -> Embodiment:
-        """What its channels are."""
+        """Names and units of its channels."""
         line = self.timeline
         return Embodiment.of(line.action_channels, line.action_kind, self.sensor, self.state)
 
@@ -83,30 +83,30 @@ def read_episode(
 
 
 def common_embodiment(
-    found: Sequence[tuple[Recording, Embodiment]], of: str, remedy: str
+    recordings: Sequence[tuple[Recording, Embodiment]], of: str, remedy: str
 ) -> Embodiment:
-    """The embodiment of all these recordings; streams that some lack are those of the others.
+    """The embodiment of all these recordings; where some lack a stream, that of the others.
 
-    Raises `StoreMismatch` that names two that differ in channels, units or kind of action, says
-    that they are to be one `of` something, and ends with the `remedy`.
+    Raises `StoreMismatch` that names two recordings of one `of` (such as a store) that differ in
+    channels, units or kind of action, and ends with the `remedy`.
     """
     common: dict[str, Channels] = {}
     for stream in ("action", "state", "sensor"):
-        having = [(one, _seen(all_of, stream)) for one, all_of in found]
-        having = [(one, seen) for one, seen in having if seen[0].names]
-        for one, seen in having[1:]:
+        having = [(recording, _kinds(own, stream)) for recording, own in recordings]
+        having = [(recording, kinds) for recording, kinds in having if kinds[0].names]
+        for recording, kinds in having[1:]:
             first, expected = having[0]
-            if seen != expected:
+            if kinds != expected:
                 raise StoreMismatch(
                     f"one {of} holds one embodiment, but the {stream} of source {first.source!r} "
-                    f"({first.path}) is {_shown(*expected)} and that of source {one.source!r} "
-                    f"({one.path}) is {_shown(*seen)}. {remedy}"
+                    f"({first.path}) is {_shown(*expected)} and that of source "
+                    f"{recording.source!r} ({recording.path}) is {_shown(*kinds)}. {remedy}"
                 )
         common[stream] = having[0][1][0] if having else _NO_CHANNELS
-    return Embodiment(action_kind=found[0][1].action_kind, **common)
+    return Embodiment(action_kind=recordings[0][1].action_kind, **common)
 
 
-def _seen(embodiment: Embodiment, stream: str) -> tuple[Channels, str]:
+def _kinds(embodiment: Embodiment, stream: str) -> tuple[Channels, str]:
     return getattr(embodiment, stream), embodiment.action_kind if stream == "action" else ""
 
 

@@ -1,4 +1,4 @@
-"""What the three formats of the needle-insertion recorder share.
+"""Shared by the three formats of the needle-insertion recorder.
 
 Channels, the task folder's name as instruction, JPEG views, robot states and sensor rows.
 """
@@ -38,8 +38,8 @@ SENSOR = Channels(
 )
 CLOCK = "origin_timestamp"
 _CLOCK_TOLERANCE_S, _CLOCK_TOLERANCE = 0.5, 0.02
-"""By how much a clock made of start and rate may miss the recording's end: in seconds, or as a
-share of the recording where that is more."""
+"""Largest distance from the end of a clock made of start and rate to the recording's end: in
+seconds, or as a share of the recording where that is more."""
 
 
 class InsertionRecording(Recording):
@@ -77,22 +77,25 @@ class InsertionRecording(Recording):
 
     @abstractmethod
     def _view_files(self) -> Mapping[str, list[Path]]:
-        """JPEGs by view, views without any left out."""
+        """JPEGs by view; a view without any is left out."""
 
     @abstractmethod
     def _data_files(self) -> Sequence[Path | None]:
-        """Where files that are not frames are, or would be."""
+        """Paths of the files that are not frames, there or not."""
 
 
 def promised(metadata: Document, **keys: Sequence[str]) -> dict[str, str]:
-    """What says that a stream was recorded, by stream: the first of its keys that there is."""
-    told: dict[str, str] = {}
+    """The evidence in the metadata that a stream was recorded: the first of its keys that is set.
+
+    A stream whose first such key is 0 or false is left out.
+    """
+    evidence: dict[str, str] = {}
     for stream, names in keys.items():
-        said = [(key, getattr(metadata, key)) for key in names]
-        key, value = next((pair for pair in said if pair[1] is not None), ("", None))
+        entries = [(key, getattr(metadata, key)) for key in names]
+        key, value = next((entry for entry in entries if entry[1] is not None), ("", None))
         if value:
-            told[stream] = f"{key} {value}"
-    return told
+            evidence[stream] = f"{key} {value}"
+    return evidence
 
 
 def robot_state_file(folder: Path) -> Path | None:

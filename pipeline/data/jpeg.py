@@ -3,6 +3,7 @@
 import math
 import os
 import re
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from filecmp import cmp
 from itertools import pairwise
@@ -20,13 +21,13 @@ from pipeline.data.media import DEFAULT_LIMITS, FARTHEST_S, check_image_file, in
 from pipeline.data.recording import CameraStream, entries, natural_key
 
 THUMBNAIL = (32, 18)
-"""Width and height of what is seen of a JPEG that is checked."""
+"""Width and height of the thumbnail of a checked JPEG."""
 
 Frame = TypeVar("Frame")
 Seen = TypeVar("Seen")
 _EYES = ("left", "right")
 _SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".gif", ".tif", ".tiff", ".webp")
-"""Of images: what the opener does not decode, it refuses by name."""
+"""Suffixes of images; files that are not decoded are refused by name."""
 _PADDED = re.compile(r"0\d+")
 """A number in place of a time: 000001."""
 _VIEW = re.compile(r"view(?=\d)", re.IGNORECASE)
@@ -72,8 +73,8 @@ class JpegCamera(CameraStream):
         return same
 
     def sizes(self, indices: Sequence[int]) -> NDArray[np.int64]:
-        found = [self._each(image_size, index) for index in indices]
-        return np.array(found, np.int64).reshape(-1, 2)
+        sizes = [self._each(image_size, index) for index in indices]
+        return np.array(sizes, np.int64).reshape(-1, 2)
 
     def _each(self, ask: Callable[[Path, str, MediaLimits], Seen], index: int) -> Seen:
         return ask(self.paths[index], str(self.paths[index]), self._limits)
@@ -114,17 +115,16 @@ def _check_one_camera(view: str, timed: Sequence[tuple[float, str]]) -> None:
     """
     names = {path: os.path.basename(path).rpartition("_")[0] for _, path in timed}  # noqa: PTH119
     of_camera = {name: path for path, name in names.items()}
-    pairs = [(a, b) for (at, a), (then, b) in pairwise(timed) if at == then and a != b]
+    pairs = [[a, b] for (at, a), (then, b) in pairwise(timed) if at == then and a != b]
     if 1 < len(of_camera) < len(names):
-        one, other, *_ = of_camera.values()
-        pairs.append((one, other))
-    for one, other in pairs[:1]:
-        raise _two_cameras(view, one, other)
+        pairs.append([*of_camera.values()])
+    if pairs:
+        raise _two_cameras(view, *pairs[0][:2])
 
 
-def _two_cameras(view: str, one: str | Path, other: str | Path) -> RecordingError:
+def _two_cameras(view: str, first: str | Path, other: str | Path) -> RecordingError:
     return RecordingError(
-        f"{one}: expected the frames of one camera in {view}, found also {other}. Move those "
+        f"{first}: expected the frames of one camera in {view}, found also {other}. Move those "
         "of another camera or form into a folder of their own"
     )
 
@@ -135,17 +135,17 @@ def list_views(folder: Path, prefix: str = "") -> dict[str, list[Path]]:
     `left` is dropped unless both eyes exist; an eye is a subfolder, the end of the folder's name,
     or the part before the time in a file's name.
     """
-    found: dict[tuple[str, str], list[Path]] = {}
+    frames: dict[tuple[str, str], list[Path]] = defaultdict(list)
     for view in _view_folders(folder, prefix):
         base, _ = split_eye(view.name)
         firsts: dict[str, Path] = {}
         for eye, path in _frames(view):
-            found.setdefault((base, eye), []).append(path)
+            frames[base, eye].append(path)
             firsts.setdefault(eye, path)
         if "" in firsts and len(firsts) > 1:
-            one, other, *_ = firsts.values()
-            raise _two_cameras(view.name, one, other)
-    return name_views(found)
+            first, other, *_ = firsts.values()
+            raise _two_cameras(view.name, first, other)
+    return name_views(frames)
 
 
 def list_empty_views(folder: Path, prefix: str = "") -> list[str]:
@@ -155,14 +155,12 @@ def list_empty_views(folder: Path, prefix: str = "") -> list[str]:
     ]
 
 
-def name_views(found: Mapping[tuple[str, str], list[Frame]]) -> dict[str, list[Frame]]:
-    """View names for (base, eye) pairs: the eye is part of the name only where both exist."""
-    eyes: dict[str, set[str]] = {}
-    for base, eye in found:
-        eyes.setdefault(base, set()).add(eye)
+def name_views(frames: Mapping[tuple[str, str], list[Frame]]) -> dict[str, list[Frame]]:
+    """Frames by view name, from (base, eye): the eye is in the name only where both exist."""
+    eyes = Counter(base for base, _ in frames)
     return {
-        base if len(eyes[base]) == 1 or not eye else f"{base}_{eye}": found[base, eye]
-        for base, eye in sorted(found, key=lambda key: natural_key("_".join(key)))
+        base if eyes[base] == 1 or not eye else f"{base}_{eye}": frames[base, eye]
+        for base, eye in sorted(frames, key=lambda key: natural_key("_".join(key)))
     }
 
 
@@ -205,13 +203,13 @@ def check_image(
 
 def _view_folders(folder: Path, prefix: str) -> list[Path]:
     there = [e for e in _entries(folder) if split_eye(e.name)[0].startswith(prefix) and e.is_dir()]
-    found = sorted((Path(entry.path) for entry in there), key=lambda view: natural_key(view.name))
-    for one, other in pairwise(sorted(found, key=lambda view: split_eye(view.name))):
-        if split_eye(one.name) == split_eye(other.name):
+    views = sorted((Path(entry.path) for entry in there), key=lambda view: natural_key(view.name))
+    for view, other in pairwise(sorted(views, key=lambda view: split_eye(view.name))):
+        if split_eye(view.name) == split_eye(other.name):
             raise RecordingError(
-                f"{one}: expected one folder of this view, found {other}. Rename it"
+                f"{view}: expected one folder of this view, found {other}. Rename it"
             )
-    return found
+    return views
 
 
 def _frames(view: Path) -> Iterator[tuple[str, Path]]:

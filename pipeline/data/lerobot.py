@@ -1,7 +1,7 @@
 """LeRobot data sets v2.0, v2.1 and v3.0: state and action from parquet, frames from video.
 
 Rows and frames pair by number; the `timestamp` column is the clock, as `lerobot_rows` reads it.
-What has no home in LeRobot lies in this project's sidecars, beside the data set's own folders:
+This project's sidecars, beside the data set's own folders, hold what has no place in LeRobot:
 `sensor/episode_000003.npz` a high-rate sensor, `state/…` states that are faster than the rows,
 `frames/…` when the images in the rows were captured.
 """
@@ -23,7 +23,15 @@ from pipeline.base.config import MediaLimits, Source
 from pipeline.base.errors import RecordingError
 from pipeline.data.arrays import MOST_CHANNELS, member, read_npz
 from pipeline.data.insertion import SENSOR
-from pipeline.data.lerobot_meta import MARKER, META, Entry, LeRobotMeta, Vector, read_meta
+from pipeline.data.lerobot_meta import (
+    MARKER,
+    META,
+    Entry,
+    LeRobotMeta,
+    Vector,
+    read_meta,
+    sidecar,
+)
 from pipeline.data.lerobot_rows import (
     CLOCK,
     FRAME,
@@ -63,7 +71,7 @@ def is_root(folder: Path, names: Collection[str]) -> bool:
 def open_data_set(
     root: Path, source: Source, views: Sequence[str] | None
 ) -> tuple[list["LeRobotRecording"], list[str]]:
-    """The episodes whose files are there, and a line for each that `meta/` lists and has none.
+    """The episodes whose files are there, and a line for each listed one whose files are not.
 
     Raises `RecordingError` where `meta/` is broken, and where `views` names a depth map.
     """
@@ -88,7 +96,7 @@ def open_data_set(
 
 
 def _refusal(path: Path) -> str:
-    """Why no episode can be in a file; empty where one can."""
+    """Why a file cannot hold an episode; empty where it can."""
     try:
         RECORDINGS.check_file(path)
     except RecordingError as error:
@@ -142,12 +150,12 @@ class LeRobotRecording(Recording):
         return sorted({self._rows.path, *videos, *sidecars})
 
     def identity(self) -> str:
-        """What `meta/info.json` decides, and where the shared files of v3.0 hold the episode.
+        """The parts of `meta/` that decide what is read of the episode's files.
 
-        Not the whole of `meta/`, which changes whenever an episode is added.
+        The whole of `meta/` changes whenever an episode is added.
         """
         read = {STATE, ACTION, *self._wanted().values()}
-        told = {
+        deciding = {
             "fps": self._info.fps,
             "features": {
                 name: {"dtype": feature.dtype, "names": feature.names, "units": feature.units}
@@ -155,13 +163,13 @@ class LeRobotRecording(Recording):
                 if name in read
             },
         }
-        described = json.dumps(told, sort_keys=True, separators=(",", ":"))
+        described = json.dumps(deciding, sort_keys=True, separators=(",", ":"))
         if (action := self._info.features.get(ACTION)) is not None and action.kind is not None:
             described += f" kind={action.kind}"
         self._check_spans()
         where, table, time = self._numbers(())
         if not np.array_equal(time, stored_clock(table, where)):
-            # Stores from before clocks were made exact hold other times of the same files.
+            # Stores that were built before clocks were made exact hold other times.
             described += " clock=frame_index/fps"
         if not self._info.shared:
             return described
@@ -171,7 +179,7 @@ class LeRobotRecording(Recording):
 
     def state(self) -> Stream | None:
         if (path := self._sidecar("state")) is not None:
-            return _sidecar_stream(path, self._overrides.limits)
+            return _read_sidecar(path, self._overrides.limits)
         return self._stream(STATE) if STATE in self._info.features else None
 
     def action(self) -> RecordedAction:
@@ -186,7 +194,7 @@ class LeRobotRecording(Recording):
 
     def sensor(self) -> Stream | None:
         path = self._sidecar("sensor")
-        return None if path is None else _sidecar_stream(path, self._overrides.limits)
+        return None if path is None else _read_sidecar(path, self._overrides.limits)
 
     def nominal(self) -> Nominal:
         clocks = ["action"]
@@ -198,14 +206,14 @@ class LeRobotRecording(Recording):
         return Nominal(dict.fromkeys(clocks, self._info.fps), where=MARKER, mistakes=mistakes)
 
     def _misplaced_rows(self) -> tuple[str, ...]:
-        """What `meta/` says wrongly of the file of v3.0 that holds the rows."""
-        rows, named = self._rows.path, self._meta.data(self._entry)
-        if rows == named:
+        """A message where `meta/` names another file than the one that holds the rows."""
+        rows, listed = self._rows.path, self._meta.data(self._entry)
+        if rows == listed:
             return ()
-        told, there = (path.relative_to(self.path).as_posix() for path in (named, rows))
+        expected, actual = (path.relative_to(self.path).as_posix() for path in (listed, rows))
         return (
-            f"meta/episodes says that the rows of {self._entry.id} lie in {told}, they lie in "
-            f"{there} and were read there; other readers may miss them. Correct its "
+            f"meta/episodes says that the rows of {self._entry.id} lie in {expected}, they lie in "
+            f"{actual} and were read there; other readers may miss them. Correct its "
             "data/chunk_index and data/file_index, or convert the data set again with lerobot "
             "0.5.0 or later (up to 0.4.4 it wrote such entries)",
         )
@@ -223,11 +231,11 @@ class LeRobotRecording(Recording):
         where, table = f"{rows.path}, {self._entry.id}", rows.columns(("task_index",))
         if not table.num_columns:
             raise META.refusal(where, "no column task_index, and meta/ names no one task")
-        asked = np.unique(matrix(table["task_index"], 1, f"{where}, 'task_index'")).tolist()
-        texts = [self._meta.task_text.get(index) for index in asked]
+        tasks = np.unique(matrix(table["task_index"], 1, f"{where}, 'task_index'")).tolist()
+        texts = [self._meta.task_text.get(index) for index in tasks]
         if len(texts) != 1 or texts[0] is None:
             raise RecordingError(
-                f"{where}: expected one task that meta/ knows, found task_index {shown(asked)}: "
+                f"{where}: expected one task that meta/ knows, found task_index {shown(tasks)}: "
                 f"{shown(texts)}; give source {self.source!r} an `instruction`"
             )
         return texts[0]
@@ -239,8 +247,8 @@ class LeRobotRecording(Recording):
         _, _, time = self._numbers()
         rows = self._rows
         videos, fps, limits = self._info.videos, self._info.fps, self._overrides.limits
-        path, rarer = self._sidecar("frames"), [v for v, key in wanted.items() if key not in videos]
-        captured = {} if path is None or not rarer else read_npz(path, rarer, limits=limits)
+        path, images = self._sidecar("frames"), [v for v, k in wanted.items() if k not in videos]
+        captured = read_npz(path, images, limits=limits) if path and images else {}
         return {
             view: VideoClip(view, time, self._video(key), fps, limits)
             if key in videos
@@ -249,10 +257,10 @@ class LeRobotRecording(Recording):
         }
 
     def _stream(self, name: str) -> Stream:
-        feature, told = self._info.features[name], f"{self.path / MARKER}, {name!r}"
-        vector = META.parse(feature.model_dump(), Vector, told)
+        feature, where = self._info.features[name], f"{self.path / MARKER}, {name!r}"
+        vector = META.parse(feature.model_dump(), Vector, where)
         stem, (width,) = name.rpartition(".")[2], vector.shape
-        channels = _channels(stem, width, vector.names, feature.units, told)
+        channels = _channels(stem, width, vector.names, feature.units, where)
         where, table, time = self._numbers()
         if name not in table.column_names:
             raise RECORDINGS.refusal(where, f"missing column {name!r}")
@@ -275,7 +283,7 @@ class LeRobotRecording(Recording):
     def _numbers(
         self, streams: Sequence[str] = (STATE, ACTION)
     ) -> tuple[str, pa.Table, NDArray[np.float64]]:
-        """The episode's rows of these streams, where they stand, and their clock."""
+        """The place of the episode's rows for messages, these columns of them, and their clock."""
         rows = self._rows
         table = rows.columns((CLOCK, FRAME, *streams))
         check_frames(table, rows)
@@ -284,20 +292,19 @@ class LeRobotRecording(Recording):
 
     def _sidecar(self, name: str) -> Path | None:
         """The episode's file of that name, where there is one."""
-        # Not `self.id`, before which parent folders may stand.
-        path = self.path / name / f"{self._entry.id}.npz"
+        path = sidecar(self.path, name, self._entry.index)
         return path if os.path.lexists(path) else None
 
 
 def action_kind(names: Sequence[str]) -> ActionKind:
-    """What the names of the action's channels say; absolute where they say nothing."""
+    """The kind of action that the names of its channels tell; absolute where they tell none."""
     lower = [name.lower() for name in names]
     if any("vel" in name for name in lower):
         return "velocity"
     return "delta" if any(_DELTA.fullmatch(name) for name in lower) else "absolute"
 
 
-def _sidecar_stream(path: Path, limits: MediaLimits) -> Stream:
+def _read_sidecar(path: Path, limits: MediaLimits) -> Stream:
     """The stream of a file with `timestamps` and `values`, and perhaps `names` and `units`."""
     members = read_npz(path, ("timestamps", "values"), text=("names", "units"), limits=limits)
     values = member(members, ("values",), path)

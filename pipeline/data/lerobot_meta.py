@@ -61,6 +61,11 @@ def _flat_names(names: Any) -> Any:
     return tuple(name for part in lists for name in part)
 
 
+def sidecar(root: Path, name: str, index: int = 0) -> Path:
+    """This project's file beside a data set of that name, for an episode; there or not."""
+    return root / name / f"episode_{index:06d}.npz"
+
+
 class _VideoInfo(Document):
     depth: Annotated[bool | None, Strict(False)] = Field(default=None, alias="is_depth_map")
     video_depth: Annotated[bool | None, Strict(False)] = Field(
@@ -69,17 +74,17 @@ class _VideoInfo(Document):
 
 
 class Feature(Document):
-    """What `info.json` says of a column, or of a video."""
+    """A column or a video, as `info.json` describes it."""
 
     dtype: Text
     shape: JsonValue = None
     names: JsonValue = None
     units: tuple[Text, ...] | None = None
     kind: ActionKind | None = None
-    """Of the actions; None where their names tell it."""
+    """The kind of the actions; None where their names tell it."""
     info: _VideoInfo | None = None
     video_info: _VideoInfo | None = None
-    """What sets migrated from v1 call `info`."""
+    """The name of `info` in sets that were migrated from v1."""
 
     @property
     def is_depth_map(self) -> bool:
@@ -89,7 +94,7 @@ class Feature(Document):
 
 
 class Vector(Document):
-    """What `info.json` says of the numbers of a column; judged only where the column is read."""
+    """A column of numbers, as `info.json` describes it; checked only where the column is read."""
 
     shape: Annotated[tuple[Index], Strict(False)]
     names: Annotated[tuple[Text, ...] | None, BeforeValidator(_flat_names)] = None
@@ -223,10 +228,10 @@ class LeRobotMeta:
     root: Path
     info: Info
     entries: Sequence[Entry]
-    """By index."""
+    """In the order of their indices."""
     task_text: Mapping[int, str]
     limits: MediaLimits
-    """Of its files."""
+    """Limits of its files."""
 
     def data(self, entry: Entry) -> Path:
         """The file of an episode's rows, as `meta/` says."""

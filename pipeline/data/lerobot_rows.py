@@ -19,22 +19,16 @@ from pipeline.data.jpeg import check_image, read_image
 from pipeline.data.lerobot_meta import META, Entry, LeRobotMeta
 from pipeline.data.media import RECORDINGS
 from pipeline.data.parquet import ParquetTable
-from pipeline.data.recording import (
-    CameraStream,
-    check_clock,
-    check_resolution,
-    check_rising_clock,
-    natural_key,
-)
+from pipeline.data.recording import CameraStream, check_clock, check_resolution, natural_key
 
 CLOCK = "timestamp"
 FRAME = "frame_index"
 EPISODE = "episode_index"
 _SAME_S = 1e-9
-"""By which sums of steps in float64 may differ and be the same time."""
+"""Largest difference of two sums of steps in float64 that are the same time."""
 _ROUNDINGS = 2
-"""Steps of the stored type by which a time may differ from that of its frame number: the writer
-may have multiplied by a rounded 1 / fps."""
+"""Most steps of the stored type between a time and that of its frame number: the writer may have
+multiplied by a rounded 1 / fps."""
 _LATEST_S = 1e12
 """Nanoseconds reach it in a quarter of an hour: no clock is in seconds there."""
 _UNITS = {"milliseconds": 1e3, "microseconds": 1e6, "nanoseconds": 1e9}
@@ -54,7 +48,7 @@ class ParquetRows:
         return self.table.path
 
     def columns(self, wanted: Sequence[str]) -> pa.Table:
-        """Those wanted columns that the file has, (row,) each, of numbers or lists of them."""
+        """The wanted columns that the file has, (row,) each, of numbers or lists of them."""
         groups, offset = self.table.groups(self.start, self.stop)
         rows = self.table.numbers(wanted, groups).slice(self.start - offset, self.stop - self.start)
         if rows.num_columns and rows.num_rows != self.stop - self.start:
@@ -222,12 +216,12 @@ def read_clock(table: pa.Table, fps: float, where: str) -> NDArray[np.float64]:
     _check_seconds(stored, fps, where)
     time = _exact(stored, _stored_type(table), _frames(table, where), fps)
     # Rows are chosen by time: of two at one time, the earlier would show the later's frame.
-    check_rising_clock(time, f"{where}, {CLOCK!r}")
+    check_clock(time, f"{where}, {CLOCK!r}", rising=True)
     return time
 
 
 def stored_clock(table: pa.Table, where: str) -> NDArray[np.float64]:
-    """(row,) the column `timestamp` as it stands in the file."""
+    """(row,) the column `timestamp` of the file, s."""
     if CLOCK not in table.column_names:
         raise RECORDINGS.refusal(where, f"missing column {CLOCK!r}")
     where += f", {CLOCK!r}"
@@ -241,7 +235,7 @@ def stored_clock(table: pa.Table, where: str) -> NDArray[np.float64]:
 def check_frames(table: pa.Table, rows: ParquetRows) -> None:
     """Raise `RecordingError` where frame numbers do not rise.
 
-    They may begin above 0 and leave some out: rows can have been taken away.
+    They may begin above 0 and have gaps: rows can have been removed.
     """
     frame = _frames(table, str(rows.path))
     if (fallen := np.flatnonzero(~(np.diff(frame) > 0))).size:
@@ -261,7 +255,7 @@ def _frames(table: pa.Table, where: str) -> NDArray[np.float64]:
 
 
 def _stored_type(table: pa.Table) -> "np.dtype[Any]":
-    """Of the column `timestamp`; float64 for whole numbers."""
+    """The type of the column `timestamp`; float64 for whole numbers."""
     kind = table.schema.field(CLOCK).type
     kind = getattr(kind, "value_type", kind)
     return np.dtype(kind.to_pandas_dtype() if pa.types.is_floating(kind) else np.float64)
@@ -270,10 +264,10 @@ def _stored_type(table: pa.Table) -> "np.dtype[Any]":
 def _exact(
     stored: NDArray[np.float64], dtype: "np.dtype[Any]", frame: NDArray[np.float64], fps: float
 ) -> NDArray[np.float64]:
-    """`offset + frame / fps` where all stored times are that but for the rounding of `dtype`.
+    """`offset + frame / fps` where all stored times differ from it by the rounding of `dtype` only.
 
-    The offset is a whole number of frames, or the shortest decimal that is stored so. Times that
-    were not rounded to a type narrower than float64 stay as they are.
+    The offset is a whole number of frames, or the shortest decimal that is stored as the first
+    time. Other times, and those of float64, stay as they are.
     """
     if dtype == np.float64:
         return stored

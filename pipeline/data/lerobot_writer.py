@@ -18,12 +18,12 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from pipeline.data.lerobot_meta import MARKER
+from pipeline.data.lerobot_meta import MARKER, sidecar
 
 Columns = Mapping[str, NDArray[Any]]
 """By feature key: (row,) or (row, channel), `timestamp` (s since the first row) among them."""
 Features = Mapping[str, Mapping[str, Any]]
-"""What `info.json` says of features beside their type and shape."""
+"""By feature key: entries of `info.json` beside type and shape."""
 
 _DATA: Final = {
     "v2.1": "data/chunk-{episode_chunk:03d}/episode_{episode_index:06d}.parquet",
@@ -34,7 +34,7 @@ _NUMBERING: Final = ("timestamp", "frame_index", "episode_index", "index", "task
 _STATISTICS_EVERY: Final = 10
 """Frames between those that image statistics are taken from."""
 _IMAGES_A_GROUP: Final = 64
-"""Of the parquet file's rows: equal images are stored once a group, which is held in memory."""
+"""Images in a row group: equal images are stored once a group, which is held in memory."""
 _DICTIONARY_BYTES: Final = 2**30
 _FIRST: Final = {"chunk_index": 0, "file_index": 0}
 _IMAGE: Final = pa.struct(
@@ -61,8 +61,8 @@ def write_v21(
     lengths: list[int] = []
     statistics: list[dict[str, Any]] = []
     described: dict[str, dict[str, Any]] = {}
-    for index, (given, frames) in enumerate(episodes):
-        columns = _numbered(given, index, sum(lengths))
+    for index, (own, frames) in enumerate(episodes):
+        columns = _numbered(own, index, sum(lengths))
         place = {"episode_chunk": 0, "episode_index": index}
         data = root / _DATA["v2.1"].format(**place)
         data.parent.mkdir(parents=True, exist_ok=True)
@@ -74,10 +74,11 @@ def write_v21(
         cameras = {key: _video_feature(film, fps) for key, film in frames.items()}
         described = _described(columns, cameras, features)
     (root / "meta").mkdir()
-    told = {"tasks": [task]}
     for name, rows in {
         "tasks": [{"task_index": 0, "task": task}],
-        "episodes": [{"episode_index": i, **told, "length": n} for i, n in enumerate(lengths)],
+        "episodes": [
+            {"episode_index": i, "tasks": [task], "length": n} for i, n in enumerate(lengths)
+        ],
         "episodes_stats": [{"episode_index": i, "stats": s} for i, s in enumerate(statistics)],
     }.items():
         lines = "".join(json.dumps(row) + "\n" for row in rows)
@@ -113,16 +114,11 @@ def write_v30(
     column = {"name": "task", "field_name": "task"}
     column |= {"pandas_type": "unicode", "numpy_type": "object"}
     index = {"index_columns": ["task"], "columns": [column], "column_indexes": []}
-    told = {"pandas": json.dumps(index)}
-    tasks = pa.table({"task_index": [0], "task": [task]}, metadata=told)
+    pandas = {"pandas": json.dumps(index)}
+    tasks = pa.table({"task_index": [0], "task": [task]}, metadata=pandas)
     pq.write_table(tasks, root / "meta" / "tasks.parquet")
     cameras = {key: {"dtype": "image", "names": ["height", "width", "channel"]} for key in images}
     _write_info(root, "v3.0", [rows], _described(columns, cameras, features), fps)
-
-
-def sidecar(root: Path, name: str, index: int = 0) -> Path:
-    """Where an episode's file of what LeRobot has no place for lies, by its kind."""
-    return root / name / f"episode_{index:06d}.npz"
 
 
 def write_sidecar(

@@ -1,4 +1,4 @@
-"""The border of recordings: how they are refused, and how much one file of them may ask for."""
+"""The border of recordings: their refusals, and the limits of one of their files."""
 
 from collections.abc import Generator
 from contextlib import contextmanager
@@ -20,25 +20,25 @@ from pipeline.base.errors import RecordingError
 
 RECORDINGS = Border(RecordingError, "Copy the file again, or leave the episode out.")
 INTACT = Border(RecordingError, "Write the file again as expected, or leave the episode out.")
-"""Of what is no damage, so that a copy would be the same."""
+"""Refuses a file that is whole: a copy would be refused, too."""
 
 DEFAULT_LIMITS = MediaLimits()
-"""Of a file that is of no source."""
+"""Limits of a file that belongs to no source."""
 FARTHEST_S = 1e20
 """No clock is farther from zero: nanoseconds since 1970 are 1e18."""
 Seconds = Annotated[float, Field(ge=-FARTHEST_S, le=FARTHEST_S)]
 Rate = Annotated[float, Field(ge=1e-3, le=1e6)]
-"""Of a stream, in Hz."""
+"""Rate of a stream, in Hz."""
 
 _ALWAYS_TAKEN = 256 * 2**20
-"""Unpacked bytes that no ratio forbids: what stands still packs a thousandfold."""
+"""Unpacked bytes that no ratio forbids: a constant stream packs a thousandfold."""
 _IMAGES = ("JPEG", "PNG")
 _AS_RGB = ("1", "L", "LA", "P", "PA", "RGB", "RGBA", "CMYK")
-"""Modes of images that are shown in RGB as they are; what is transparent is opaque then."""
+"""Modes of images that are converted to RGB; transparent pixels become opaque."""
 _SIXTEEN_BITS = ("I;16", "I;16B", "I;16L", "I;16N")
-"""Modes of grey in 16 bits, of which the upper eight are shown."""
+"""Modes of grey in 16 bits; the upper eight are kept."""
 _IMAGE_BYTES = 16 * 2**20
-"""That an image may have beside one for each pixel of the limits; a good JPEG has half of that."""
+"""Bytes that an image may have beside one for each pixel of the limits; a good JPEG has half."""
 _SCAN, _MOST_SCANS = b"\xff\xda", 100
 """A progressive JPEG has about ten; each goes over all pixels again."""
 _PNG, _MOST_CHUNKS = b"\x89PNG\r\n\x1a\n", 100_000
@@ -52,18 +52,18 @@ Image.MAX_IMAGE_PIXELS = None  # The limits of a source are held against the hea
 
 
 class Grouped(Document):
-    """What the metadata of an episode of any format may say."""
+    """Metadata of an episode that may name its group."""
 
     group: Text | Annotated[int, Field(ge=-(10**9), lt=10**9)] | None = None
 
     @property
     def group_name(self) -> str | None:
-        """What the episode belongs to with others; None where it says nothing."""
+        """The episode's group; None where it names none."""
         return None if self.group in (None, "") else str(self.group)
 
 
 def check_unpacked(where: Path | str, unpacked: int, packed: int, limits: MediaLimits) -> None:
-    """Refuse an array or a table of so many bytes in so many bytes of a file, before it is read."""
+    """Refuse an array or a table by its bytes, unpacked and in the file, before it is read."""
     ratio = max(_ALWAYS_TAKEN, int(limits.ratio * packed))
     for most, name in ((limits.array_bytes, "array_bytes"), (ratio, "ratio")):
         check_limit(where, unpacked, most, name, "bytes unpacked")
@@ -151,13 +151,13 @@ def opened_video(
         yield container, stream
 
 
-def check_limit(where: Path | str, found: int, most: int, name: str, what: str) -> None:
-    """Refuse what is more than `limits.<name>` of its source allow."""
-    if found > most:
+def check_limit(where: Path | str, count: int, most: int, name: str, what: str) -> None:
+    """Refuse a count above `limits.<name>` of its source."""
+    if count > most:
         raise Border(
             RecordingError,
             f"Leave the episode out, or if this is right, raise limits.{name} of its source.",
-        ).refusal(where, f"expected at most {most:,} {what}, found {found:,}")
+        ).refusal(where, f"expected at most {most:,} {what}, found {count:,}")
 
 
 def _chunks(stream: IO[bytes]) -> int:

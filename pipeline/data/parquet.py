@@ -1,4 +1,4 @@
-"""Parquet files: opened in one place, and read only where what they declare is within limits."""
+"""Parquet files, read only where the sizes that they declare are within limits."""
 
 from collections.abc import Generator, Iterator, Sequence
 from contextlib import contextmanager
@@ -23,14 +23,14 @@ _BATCH_ROWS = 1024
 
 @dataclass(frozen=True)
 class ParquetTable:
-    """A parquet file; everything that is wrong with it is a `RecordingError` that names it."""
+    """A parquet file; its methods raise `RecordingError` that names it for all that is wrong."""
 
     path: Path
     limits: MediaLimits
 
     @contextmanager
     def open(self) -> Generator[pq.ParquetFile, None, None]:
-        """The open file; what goes wrong inside is told as said above."""
+        """The open file; an error inside becomes a `RecordingError`."""
         RECORDINGS.check_file(self.path)
         unreadable = RECORDINGS.foreign(self.path, "cannot be read as parquet")
         with unreadable, pq.ParquetFile(self.path) as file:
@@ -39,7 +39,7 @@ class ParquetTable:
     def check(
         self, file: pq.ParquetFile, wanted: Sequence[str], groups: Sequence[int]
     ) -> tuple[list[str], int]:
-        """Those of the wanted columns that the file has, and the most bytes that a cell can have.
+        """The wanted columns that the file has, and the most bytes that a cell can have.
 
         Refuses a column that stands twice, and more bytes in these row groups than the limits
         allow; nothing is read.
@@ -62,7 +62,7 @@ class ParquetTable:
         return there, pages
 
     def rows(self, wanted: Sequence[str]) -> Iterator[tuple[str, dict[str, Any]]]:
-        """Where each row stands, and its cells in those wanted columns that there are."""
+        """The place of each row for messages, and its cells in the wanted columns that exist."""
         with self.open() as file:
             there, largest = self.check(file, wanted, range(file.num_row_groups))
             # A text that is stored once can stand in every row.
@@ -74,9 +74,9 @@ class ParquetTable:
                     number += 1
 
     def numbers(self, wanted: Sequence[str], groups: Sequence[int] | None = None) -> pa.Table:
-        """Those wanted columns that the file has, of numbers or lists of them.
+        """The wanted columns that the file has, of numbers or lists of them.
 
-        Of these row groups; of all where None.
+        They are of these row groups; of all where it is None.
         """
         return _numbers(self, self._stamp(), tuple(wanted), groups and tuple(groups))
 
@@ -92,7 +92,7 @@ class ParquetTable:
         return range(first, last + 1), int(ends[first] - counts[first])
 
     def _stamp(self) -> int:
-        """What changes when the file does."""
+        """A number that changes when the file does."""
         RECORDINGS.check_file(self.path)
         return self.path.stat().st_mtime_ns
 

@@ -1,4 +1,4 @@
-"""The recorder's raw format: every clock as it came.
+"""The recorder's raw format: every stream with its own clock.
 
 `robot_state_<tag>.csv`, `sensor_data_<tag>.npz` and `View1..5/` (or `View1/left/`) of JPEGs.
 """
@@ -11,12 +11,7 @@ from pathlib import Path
 from pipeline.base.config import Source
 from pipeline.base.errors import RecordingError
 from pipeline.data.arrays import member, read_npz
-from pipeline.data.insertion import (
-    SENSOR,
-    InsertionRecording,
-    read_state_csv,
-    sensor_rows,
-)
+from pipeline.data.insertion import SENSOR, InsertionRecording, read_state_csv, sensor_rows
 from pipeline.data.jpeg import list_empty_views, list_views
 from pipeline.data.media import RECORDINGS, Grouped
 from pipeline.data.recording import Stream, checked_stream
@@ -24,7 +19,7 @@ from pipeline.data.recording import Stream, checked_stream
 _STATE_FILES = "robot_state_*.csv"
 _SENSOR_FILES = "sensor_data_*.npz"
 _METADATA = "metadata.json"
-"""Of which only `group` is read."""
+"""A file of which only `group` is read."""
 MARKER = f"{_STATE_FILES} and {_SENSOR_FILES}"
 
 
@@ -79,13 +74,13 @@ class RawRecording(InsertionRecording):
         return [view for view in list_empty_views(self.path, prefix="View") if self._wants(view)]
 
     def _only(self, pattern: str) -> Path | None:
-        found = sorted(self.path.glob(pattern))
-        if len(found) > 1:
+        files = sorted(self.path.glob(pattern))
+        if len(files) > 1:
             raise RecordingError(
-                f"{self.path}: expected one {pattern}, found {', '.join(p.name for p in found)}; "
+                f"{self.path}: expected one {pattern}, found {', '.join(p.name for p in files)}; "
                 "leave the right one and move the others away"
             )
-        return found[0] if found else None
+        return files[0] if files else None
 
     def _view_files(self) -> Mapping[str, list[Path]]:
         return list_views(self.path, prefix="View")

@@ -1,4 +1,4 @@
-"""What a recording is, whatever its format on disk.
+"""A recording of any format on disk.
 
 A `Recording` is one episode. Making one touches metadata only; `state()`, `sensor()`, `poses()`
 and `action()` read a whole numeric stream; `cameras()` lists clocks and leaves the pixels on disk
@@ -29,7 +29,7 @@ from pipeline.base.source import CLOCK_SLACK_S
 from pipeline.data.media import FARTHEST_S, RECORDINGS
 
 _MOST_BYTES = 2**38
-"""Of a file of an episode: none is read through before its size is known to be possible."""
+"""Largest size of a file of an episode; a larger one is refused unread."""
 ActionKind = Literal["absolute", "velocity", "delta"]
 
 
@@ -64,16 +64,16 @@ class RecordedAction(Stream):
 
 @dataclass(frozen=True)
 class Nominal:
-    """What a recording says of itself beside its data; empty where it says nothing."""
+    """Rates and counts that a recording's metadata name; empty where they name none."""
 
     rates_hz: Mapping[str, float] = field(default_factory=dict[str, float])
     """By clock: `sensor`, `state`, `action`, `view View1`, …"""
     streams: Mapping[str, str] = field(default_factory=dict[str, str])
-    """What says that a stream was recorded, by its name: `state`: `robot_states_count 300`."""
+    """By stream, the entry that says that it was recorded: `state`: `robot_states_count 300`."""
     where: str = ""
-    """The file that says so."""
+    """The metadata's file."""
     mistakes: tuple[str, ...] = ()
-    """What it says that is not so and was read in spite of it, each with its mend."""
+    """Wrong entries that did not keep the episode from being read, each with its mend."""
 
 
 class CameraStream(ABC):
@@ -84,9 +84,9 @@ class CameraStream(ABC):
 
     @property
     def covered(self) -> NDArray[np.float64]:
-        """A clock from whose first to whose last entry the view is there, s; else `time`.
+        """(entry,) s, a clock from whose first to whose last entry the view shows a frame.
 
-        Of a recording that was given a frame now and then, the last stands until the end.
+        It is `time`, unless a frame stands in several rows: then it is the rows' clock.
         """
         return self.time
 
@@ -94,8 +94,8 @@ class CameraStream(ABC):
     def check(self, indices: Sequence[int]) -> NDArray[np.uint8] | None:
         """Raise `RecordingError` naming the first of these frames that cannot be decoded.
 
-        Cheaper than `read`; called before anything expensive runs. Gives what was seen on the way:
-        thumbnails (index, height, width, 3), RGB, of one small size; None where nothing was.
+        Cheaper than `read`; called before anything expensive runs. Returns thumbnails (index,
+        height, width, 3), RGB, of one small size, where the check decodes frames, else None.
         """
 
     @abstractmethod
@@ -124,7 +124,7 @@ class Recording(ABC):
     path: Path
 
     def __init__(self, path: Path, source: Source, views: Sequence[str] | None) -> None:
-        """Of the views, only those in `views` are kept; all of them where it is None."""
+        """Only the views in `views` are kept; all of them where it is None."""
         self.path = path
         self.id = path.name
         self.source = source.name
@@ -158,7 +158,7 @@ class Recording(ABC):
         return self._views is None or view in self._views
 
     def identity(self) -> str:
-        """What, beside its files, tells this episode from others in the same files; often ''."""
+        """Text that tells this episode from others in the same files; often ''."""
         return ""
 
     def cameras(self) -> Mapping[str, CameraStream]:
@@ -171,9 +171,9 @@ class Recording(ABC):
 
     @property
     def group(self) -> str | None:
-        """What the recording says it belongs to with others, such as an object or a day.
+        """The group that the recording names, such as an object or a day; None where it names none.
 
-        Training holds out whole groups. None where it says nothing.
+        Training holds out whole groups.
         """
         return None
 
@@ -182,11 +182,11 @@ class Recording(ABC):
         return []
 
     def depth_views(self) -> Sequence[str]:
-        """Cameras whose pictures are depth maps: no views, the model is not shown them."""
+        """Cameras with depth maps, which are no views: the model does not see them."""
         return []
 
     def nominal(self) -> Nominal:
-        """What the recording says of its rates and counts."""
+        """Rates and counts that the recording's metadata name."""
         return Nominal()
 
     def state(self) -> Stream | None:
@@ -199,7 +199,7 @@ class Recording(ABC):
 
     @property
     def has_poses(self) -> bool:
-        """Whether `poses()` gives something; known without reading it."""
+        """Whether `poses()` returns a stream; known without reading it."""
         return False
 
     def poses(self) -> Stream | None:
@@ -214,7 +214,7 @@ class Recording(ABC):
 def checked_stream(
     channels: Channels, stored: NDArray[Any], values: NDArray[Any], where: str
 ) -> Stream:
-    """A `Stream` after checking what every stream must be; `stored` is its clock as in the file.
+    """A checked `Stream`; `stored` is its clock as in the file.
 
     Raises `RecordingError` (beginning with `where`) on differing lengths, a width other than the
     channels', an empty stream, NaN or inf (row and channel named), a clock that goes backwards and
@@ -246,28 +246,30 @@ def checked_stream(
     return Stream(channels, time, values)
 
 
-def check_clock(time: NDArray[np.float64], where: str) -> None:
+def check_clock(time: NDArray[np.float64], where: str, rising: bool = False) -> None:
     """Raise `RecordingError` where a clock is not finite, farther from zero than any clock, or goes
-    backwards."""
+    backwards; where it has to be `rising`, also where it stands still."""
     far = np.flatnonzero(~(np.abs(time) <= FARTHEST_S))
     if far.size:
         raise RECORDINGS.refusal(
             where, f"timestamp {time[far[0]]} in row {far[0]}, expected seconds"
         )
-    backwards = np.flatnonzero(np.diff(time) < 0)
-    if backwards.size:
-        row = int(backwards[0]) + 1
+    steps = np.diff(time)
+    wrong = np.flatnonzero(steps <= 0 if rising else steps < 0)
+    if wrong.size:
+        row = int(wrong[0]) + 1
+        course = "goes backwards" if steps[wrong[0]] < 0 else "stands still"
         raise RecordingError(
-            f"{where}: the clock goes backwards at row {row}: "
-            f"{time[row]:.6f} s after {time[row - 1]:.6f} s"
+            f"{where}: the clock {course} at row {row}: {time[row]:.6f} s after "
+            f"{time[row - 1]:.6f} s{'; it must rise from row to row' * rising}"
         )
 
 
 def check_resolution(stored: NDArray[Any], where: str) -> None:
     """Raise `RecordingError` where a clock, of the type in its file, is too coarse for its rate.
 
-    That is where steps of the type, or of decimals that all times were rounded to, are so long that
-    more than two entries share one on average.
+    It is too coarse where more than two entries on average share a step of the type, or of the
+    decimals to which all times are rounded.
     """
     time = stored.astype(np.float64)
     apart = (time[-1] - time[0]) / (len(time) - 1) if len(time) > 1 else 1.0
@@ -281,23 +283,11 @@ def check_resolution(stored: NDArray[Any], where: str) -> None:
         )
 
 
-def check_rising_clock(time: NDArray[np.float64], where: str) -> None:
-    """Raise `RecordingError` where a clock is not finite, goes backwards or stands still."""
-    check_clock(time, where)
-    still = np.flatnonzero(np.diff(time) == 0)
-    if still.size:
-        row = int(still[0]) + 1
-        raise RecordingError(
-            f"{where}: the clock stands still at row {row}: "
-            f"{time[row]:.6f} s after {time[row - 1]:.6f} s; it must rise from row to row"
-        )
-
-
 def content_digest(recording: Recording, digest_of: Callable[[Path], str]) -> str:
     """Digest of a recording's files, wherever they lie; equal content means equal streams.
 
-    `digest_of` gives that of one file. Raises `RecordingError`, and what `digest_of` raises where a
-    file cannot be read.
+    `digest_of` returns the digest of one file. Raises `RecordingError`, and what `digest_of` raises
+    where a file cannot be read.
     """
     # Frame times stand in file names, so a name is content too; where the folder lies is not.
     named: list[tuple[str, str]] = []
@@ -312,7 +302,7 @@ def content_digest(recording: Recording, digest_of: Callable[[Path], str]) -> st
 
 
 def entries(folder: Path) -> list[os.DirEntry[str]]:
-    """What is in a folder; `RecordingError` where it cannot be listed."""
+    """The entries of a folder; `RecordingError` where it cannot be listed."""
     with RECORDINGS.foreign(folder, "cannot be listed"), os.scandir(folder) as listed:
         return list(listed)
 

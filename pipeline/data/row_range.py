@@ -1,4 +1,4 @@
-"""VL rows and the frames that they show, decoded when they are asked for."""
+"""VL rows and their frames, decoded on demand."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -18,11 +18,11 @@ Frames = dict[str, NDArray[np.uint8]]
 
 @dataclass(frozen=True)
 class RowRange:
-    """Rows of one episode, ascending, and the frame of each view for each."""
+    """Rows of one episode, ascending, and the number of each view's frame in each row."""
 
     recording: Recording
     cameras: Mapping[str, CameraStream]
-    """Opened once an episode: listing its frames costs time."""
+    """Of the whole episode: listing its frames takes time."""
     rows: NDArray[np.int64]
     """Store-global VL rows."""
     frames: Mapping[str, NDArray[np.int64]]
@@ -36,7 +36,7 @@ class RowRange:
         frame_time: NDArray[np.float64],
         views: Sequence[str],
     ) -> Self:
-        """Which frames rows show follows from the capture times (row, view) that a store has.
+        """The frames of rows with these capture times (row, view), as a store holds them.
 
         Raises `RecordingError` where the recording has no frames of these times.
         """
@@ -47,7 +47,7 @@ class RowRange:
                 continue
             clock = cameras[view].time if view in cameras else np.zeros(0)
             frames[view] = last_at(clock, times)
-            # A store has the cameras' own times, so that any other is not of this frame.
+            # A store holds the cameras' own times, so another time is of another frame.
             if (frames[view] < 0).any() or not np.array_equal(clock[frames[view]], times):
                 raise RecordingError(
                     f"{recording.path}: {view} has no frames at the times that the store has"
@@ -64,7 +64,7 @@ class RowRange:
 
 
 class RowFrames:
-    """Which recording each VL row is of, and when its frames were captured."""
+    """The recordings of a store's VL rows, and the capture times of their frames."""
 
     def __init__(
         self,
@@ -74,9 +74,9 @@ class RowFrames:
         views: Sequence[str],
         open_episodes: int = 8,
     ) -> None:
-        """Of all episodes of a store: where the rows of each begin (episode + 1,), (row, view) s.
+        """`vl_start` (episode + 1,) is each episode's first row, `frame_time` (row, view) in s.
 
-        The cameras of so many episodes are kept open.
+        The cameras of `open_episodes` episodes are kept open.
         """
         self.vl_start = vl_start
         self.frame_time = frame_time
@@ -85,7 +85,7 @@ class RowFrames:
         self._cameras = lru_cache(open_episodes)(lambda episode: recordings[episode].cameras())
 
     def ranges(self, rows: NDArray[np.int64], most: int | None = None) -> Iterator[RowRange]:
-        """These rows, ascending, in ranges of one episode and at most so many rows each.
+        """These rows, ascending, in ranges of one episode and at most `most` rows each.
 
         Raises as `RowRange.of` and the recordings' `cameras` do.
         """
@@ -98,7 +98,7 @@ class RowFrames:
 def by_episode(
     rows: NDArray[np.int64], vl_start: NDArray[np.int64]
 ) -> Iterator[tuple[int, NDArray[np.int64]]]:
-    """The episodes that rows, ascending, are of, and the rows of each."""
+    """Each episode of these rows, ascending, and its rows."""
     episode = np.searchsorted(vl_start, rows, side="right") - 1
     for index in np.unique(episode).tolist():
         yield index, rows[episode == index]

@@ -1,8 +1,8 @@
-"""Clocks -> ticks: which frames, which readings, which action, which VL row.
+"""Clocks -> ticks: the frames, readings, action and VL row of each tick.
 
-All times are float64 seconds on the recording's own clock. Ticks begin when every stream that the
-episode has has begun, and end when one ends. Everything that a tick sees is at or before it; only
-its action lies ahead. What is stored later than a tick by no more than `rounding` is at it.
+All times are float64 seconds on the recording's own clock. Ticks begin when every stream of the
+episode has begun, and end when one ends. Everything that a tick sees is at or before it; only its
+action lies ahead. An entry that is stored later than a tick by at most `rounding` is at it.
 """
 
 from collections import defaultdict
@@ -20,8 +20,8 @@ from pipeline.data import Channels, RecordedAction, Recording, Stream
 ActionRotation = Literal["rotvec", "euler_delta"]
 
 FINEST_S, COARSEST_S = 1e-9, 1e-3
-"""Bounds of `rounding`: float64 seconds that are sums of steps are off by more than their last
-digit, and a reading more than a millisecond after a tick was not there, however it is stored."""
+"""Bounds of `rounding`: sums of steps in float64 are off by more than their last digit, and a
+reading more than a millisecond after a tick is later than it, however it is stored."""
 
 _MOST_TICKS = 1_000_000  # of an episode: 28 hours at 10 Hz
 _SLOWEST_HZ = 0.66  # of an episode's fastest stream: 650 Hz in milliseconds looks like 0.65
@@ -59,7 +59,7 @@ class Timeline:
     state_end: NDArray[np.int64]
     """(tick,) one past the last state at or before the tick; 0 without a state."""
     slack_s: float
-    """By how much an entry of a clock may be later than a tick and still be at it."""
+    """Most seconds by which an entry of a clock may be later than a tick and still be at it."""
 
     def frame_times(self, views: Sequence[str]) -> NDArray[np.float64]:
         """(vl_row, view) s, NaN where the episode lacks the view."""
@@ -78,10 +78,10 @@ def build_timeline(
 ) -> Timeline:
     """The ticks of one episode.
 
-    `state` and `sensor` are the recording's own streams, passed in because they are read once.
-    Raises `RecordingError` when there are no actions, when no instant is covered by every stream,
-    when clocks are not in seconds or contradict the metadata's rate, or when a delta action would
-    have to be resampled, and `ConfigError` when pose-derived actions are asked for without a rate.
+    `state` and `sensor` are the recording's own streams, which the caller has read. Raises
+    `RecordingError` where there are no actions, no instant is covered by every stream, clocks are
+    not in seconds or contradict the metadata's rate, or delta actions would have to be resampled,
+    and `ConfigError` where actions are derived from poses and `action_hz` is None.
     """
     cameras = recording.cameras()
     clocks = {f"view {view}": camera.covered for view, camera in cameras.items()}
@@ -125,16 +125,16 @@ def build_timeline(
 def choose_action_rotation(
     asked: Literal["auto", "rotvec", "euler_delta"], recordings: Sequence[Recording]
 ) -> ActionRotation:
-    """What `auto` means: rotation vectors where every recording has poses, else Euler deltas."""
+    """The convention asked for; `auto` is rotvec where every recording has poses, else Euler."""
     if asked != "auto":
         return asked
-    return "rotvec" if all(one.has_poses for one in recordings) else "euler_delta"
+    return "rotvec" if all(recording.has_poses for recording in recordings) else "euler_delta"
 
 
 def last_at(
     clock: NDArray[np.float64], times: NDArray[np.float64], slack_s: float = 0.0
 ) -> NDArray[np.int64]:
-    """For each time, the index of the last entry of a sorted clock at or before it (-1: none).
+    """By time, the index of the last entry of a sorted clock at or before it; -1 for none.
 
     An entry up to `slack_s` later is at it.
     """
@@ -142,10 +142,10 @@ def last_at(
 
 
 def rounding(clock: NDArray[np.float64]) -> float:
-    """Seconds by which two times on a clock may differ and be the same time, by how it was stored.
+    """Seconds by which two times on a clock may differ and be the same time.
 
-    That of float32 where all entries are numbers of that type. In float64 a nanosecond, which is
-    nothing beside seconds since 1970: those are compared as they are.
+    Two steps of float32 where all entries are numbers of that type; else a nanosecond, which has no
+    effect on seconds since 1970.
     """
     narrow = clock.astype(np.float32)
     if not np.array_equal(clock, narrow):
@@ -156,27 +156,30 @@ def rounding(clock: NDArray[np.float64]) -> float:
 def rate_notes(
     rates: Iterable[tuple[str, float | None, float]], action_hz: float | None
 ) -> dict[str, str]:
-    """By source: what it means that its ticks come at another rate than what was recorded.
+    """By source, what happens to actions whose ticks come at another rate than was recorded.
 
     `rates` are source, `recorded_hz` and `fastest_hz` of each episode's timeline.
     """
     if action_hz is None:
         return {}
-    said: dict[str, list[str]] = defaultdict(list)
+    notes: dict[str, str] = {}
     by_source: dict[str, list[tuple[float | None, float]]] = defaultdict(list)
     for source, recorded_hz, fastest_hz in rates:
         by_source[source].append((recorded_hz, fastest_hz))
     for source, pairs in by_source.items():
+        why: list[str] = []
         others = [hz for hz, _ in pairs if hz and abs(action_hz - hz) > RATE_TOLERANCE * hz]
         if others:
             low, high = f"{min(others):.3g}", f"{max(others):.3g}"
             span = low if min(others) == max(others) else f"{low} to {high}"
             fate = "held" if action_hz > min(others) else "left out between ticks"
-            said[source].append(f"recorded at {span} Hz: actions are {fate}")
+            why.append(f"recorded at {span} Hz: actions are {fate}")
         fastest = max(hz for _, hz in pairs)
         if action_hz > (1 + RATE_TOLERANCE) * fastest:
-            said[source].append(f"no stream is faster than {fastest:.3g} Hz: check data.action_hz")
-    return {source: f"ticks at {action_hz:g} Hz, {', '.join(why)}" for source, why in said.items()}
+            why.append(f"no stream is faster than {fastest:.3g} Hz: check data.action_hz")
+        if why:
+            notes[source] = f"ticks at {action_hz:g} Hz, {', '.join(why)}"
+    return notes
 
 
 def tick_hz(recorded_hz: Iterable[float | None], action_hz: float | None) -> float | None:
@@ -212,18 +215,19 @@ def _pose_channels(action_rotation: ActionRotation) -> Channels:
 
 
 def _recorded_hz(recording: Recording, recorded: RecordedAction) -> float | None:
-    """Rate of the recorded actions, in which metadata and clock agree; None of a single one."""
-    told, kept = recorded.rate_hz, _hz(recorded.time)
-    if told and kept:
+    """Rate of the recorded actions, on which metadata and clock agree; None of a single one."""
+    nominal, measured = recorded.rate_hz, _hz(recorded.time)
+    if nominal and measured:
         # Jitter moves the median of a short episode, a gap moves the mean: both have to differ.
         mean = (len(recorded.time) - 1) / float(recorded.time[-1] - recorded.time[0])
-        if all(abs(told - hz) > RATE_TOLERANCE * told for hz in (kept, mean)):
+        if all(abs(nominal - hz) > RATE_TOLERANCE * nominal for hz in (measured, mean)):
             raise RecordingError(
-                f"{recording.path}: its metadata say {told:g} Hz (LeRobot: fps in meta/info.json), "
-                f"and its actions are {1 / kept:.4g} s apart, which is {kept:.4g} Hz. Correct "
-                "whichever is wrong: with both, no action has a known length"
+                f"{recording.path}: its metadata say {nominal:g} Hz (LeRobot: fps in "
+                f"meta/info.json), and its actions are {1 / measured:.4g} s apart, which is "
+                f"{measured:.4g} Hz. Correct whichever is wrong: with both, no action has a known "
+                "length"
             )
-    return told or kept or None
+    return nominal or measured or None
 
 
 def _recorded_ticks(
@@ -237,7 +241,7 @@ def _recorded_ticks(
     if action_hz is None or (rate and abs(action_hz - rate) <= RATE_TOLERANCE * rate):
         slack = _slack(clocks)
         kept = (recorded.time >= start - slack) & (recorded.time <= stop + slack)
-        return _some(recording, recorded.time[kept]), recorded.values[kept]
+        return _not_empty(recording, recorded.time[kept]), recorded.values[kept]
     if recorded.kind == "delta":
         known = f"{rate:g} Hz" if rate else "a rate that a single row does not tell"
         mend = f"data.action_hz to {rate:g} or null" if rate else "data.action_hz to null"
@@ -245,7 +249,7 @@ def _recorded_ticks(
             f"{recording.path}: its actions are differences recorded at {known} and cannot be "
             f"held at data.action_hz={action_hz:g}. Set {mend}."
         )
-    time = _some(recording, _grid(recording, clocks, start, stop, action_hz))
+    time = _not_empty(recording, _grid(recording, clocks, start, stop, action_hz))
     return time, recorded.values[last_at(recorded.time, time, _slack(clocks))]
 
 
@@ -268,7 +272,7 @@ def _pose_ticks(
         )
     start, stop = _covered(recording, clocks)
     last = min(stop, float(poses.time[-1]) - 1 / action_hz)
-    time = _some(recording, _grid(recording, clocks, start, last, action_hz))
+    time = _not_empty(recording, _grid(recording, clocks, start, last, action_hz))
     edges = np.append(time, start + len(time) / action_hz)
     edges = np.minimum(edges, poses.time[-1])
     return time, _pose_actions(poses, edges, action_rotation)
@@ -311,7 +315,7 @@ def _covered(recording: Recording, clocks: _Clocks) -> tuple[float, float]:
 
 
 def _slack(clocks: _Clocks) -> float:
-    """Seconds by which an entry may lie after an instant and still be at it."""
+    """Most seconds by which an entry may lie after an instant and still be at it."""
     return max(map(rounding, clocks.values()))
 
 
@@ -330,7 +334,7 @@ def _grid(
     return start + np.arange(max(0.0, count)) / rate_hz
 
 
-def _some(recording: Recording, time: NDArray[np.float64]) -> NDArray[np.float64]:
+def _not_empty(recording: Recording, time: NDArray[np.float64]) -> NDArray[np.float64]:
     if not len(time):
         raise RecordingError(
             f"{recording.path}: too short: no tick has every stream and a following action"

@@ -30,20 +30,20 @@ _MOST_SEEKS = 1000
 
 @dataclass(frozen=True)
 class VideoSpan:
-    """Which frames of a file are an episode's: all of them where `first` is None."""
+    """An episode's frames of a file: all of them where `first` is None."""
 
     path: Path
     first: int | None = None
     count: int | None = None
-    """How many the metadata says there are; None where it does not say."""
+    """Their number by the metadata; None where it names none."""
 
 
 class _FrameTable(NamedTuple):
-    """What the container says of the frames of a clip, in order of presentation: (frame,) each."""
+    """The container's times of the frames of a clip, in order of presentation: (frame,) each."""
 
     pts: NDArray[np.int64]
     key_pts: NDArray[np.int64]
-    """Of the key frame from which decoding has to start."""
+    """The key frame from which decoding has to start."""
     key_dts: NDArray[np.int64]
 
 
@@ -103,8 +103,8 @@ class VideoClip(CameraStream):
                 yield frame
 
     def _decode_until(self, decoded: Iterator[VideoFrame], index: int, twins: int) -> VideoFrame:
-        """The frame, after so many others of the same time."""
-        pts, key_pts, said = int(self._table.pts[index]), int(self._table.key_pts[index]), ""
+        """The frame that follows `twins` others of the same time."""
+        pts, key_pts, reason = int(self._table.pts[index]), int(self._table.key_pts[index]), ""
         try:
             for frame in decoded:
                 if frame.pts == pts and not frame.is_corrupt:
@@ -117,9 +117,9 @@ class VideoClip(CameraStream):
                 if frame.pts is None or frame.pts >= pts or spoilt:
                     break
         except av.FFmpegError as error:
-            said = f" ({error.strerror})"
+            reason = f" ({error.strerror})"
         raise RecordingError(
-            f"{self._span.path}: frame {index} of view {self.view!r} cannot be decoded{said}; "
+            f"{self._span.path}: frame {index} of view {self.view!r} cannot be decoded{reason}; "
             "the video is damaged there: copy the file again"
         )
 
@@ -128,10 +128,10 @@ class VideoClip(CameraStream):
         rows, span = len(self.time), self._span
         with opened_video(self._span.path, self._limits) as (container, stream):
             packets = list(_packets(container, stream, span, self._fps, rows))
-        for found in (len(packets), span.count):
-            if found is not None and found != rows:
+        for count in (len(packets), span.count):
+            if count is not None and count != rows:
                 raise RecordingError(
-                    f"{span.path}: {found} frames of view {self.view!r} but {rows} rows; they "
+                    f"{span.path}: {count} frames of view {self.view!r} but {rows} rows; they "
                     "pair by number, so the counts must agree. Copy the video again, or leave "
                     "the episode out"
                 )

@@ -1,10 +1,14 @@
-"""A simulated needle insertion: physics, cameras, and recordings of it in every format we read.
+"""A simulated needle insertion: physics, cameras, and recordings of it in every format.
 
-arm.py              pose, orientation and joints of the arm that carries the needle
-needle_sensor.py    what the needle measures: force and OCT A-scan
-insertion.py        the physics, one step a control tick; closed-loop evaluation grows from here
-expert.py           the demonstrator
-rendering.py        three camera views
-recorder.py         an episode seen through clocks that start late and jitter
-insertion_formats.py, lerobot_format.py, demo_recordings.py    the writers
+arm.py                  pose, orientation, motion and joints of the arm that carries the needle
+needle_sensor.py        force and OCT A-scan at the needle
+layout.py               the hidden parameters of an episode
+insertion.py            the physics, one step a control tick
+expert.py               the demonstrator
+rendering.py            three camera views
+environment.py          the insertion as a gymnasium environment
+realtime.py             the environment at the pace of a clock, as a robot
+recorder.py             an episode through clocks that start late and jitter
+insertion_formats.py    writers of an episode in each format
+demo_recordings.py      the demo's sets
 """

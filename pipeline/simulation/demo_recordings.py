@@ -2,8 +2,9 @@
 
     raw/<task>/data_collection_…   new/<task>/episode_…   old/<task>/recv_all_…   lerobot/
 
-`demo.json` says which seed and version wrote which sets and what is in them, so that finished sets
-are kept, sets of other params replaced, and nothing that the demo did not write is ever touched.
+`demo.json` names the seed and version that wrote the sets, and digests of the sets: finished sets
+are kept, sets of other params are replaced, and files that the demo did not write are never
+touched.
 """
 
 from collections.abc import Callable, Iterator
@@ -33,7 +34,7 @@ from pipeline.simulation.insertion_formats import (
 from pipeline.simulation.recorder import SimulatedEpisode, simulate_episode
 
 DEMO_VERSION: Final = 2
-"""Goes up whenever the same seed gives other recordings."""
+"""To raise whenever the same seed gives other recordings."""
 MARKER: Final = "demo.json"
 _MARKERS: Final = {MARKER, ownership.MARKER}
 DEMO: Final = OutputKind("what the demo wrote", lambda folder: (folder / MARKER).is_file())
@@ -49,14 +50,14 @@ BORDER: Final = Border(ConfigError, "Remove the folder that it is in and run aga
 
 
 class _Marker(Document):
-    """What wrote the sets of a folder."""
+    """What `demo.json` holds."""
 
     version: int = 0
     episodes: int = 0
     seed: int = 0
     sets: tuple[Literal["raw", "new", "old", "lerobot"], ...] = ()
     contents: dict[Text, Text] = Field(default_factory=dict)
-    """By set, or "" for the checkpoint that it lies in: `contents_digest` as it was written."""
+    """`contents_digest` of each set when it was written; "" is the checkpoint beside the marker."""
 
 
 Episodes = Iterator[SimulatedEpisode]
@@ -66,9 +67,9 @@ Write = Callable[[Path, Episodes], None]
 def write_demo_recordings(root: Path, episodes: int, seed: int) -> None:
     """Make `root` hold `episodes` simulated episodes in each of the four formats.
 
-    Each set appears whole or not at all, and is left alone where it is there already; the same
-    arguments give the same bytes. Raises `ConfigError` where `root` holds something the demo did
-    not write, `DiskFull` where the disk is.
+    Each set appears whole or not at all; a set that is there already stays as it is. The same
+    arguments give the same bytes. Raises `ConfigError` where `root` holds something that the demo
+    did not write, `DiskFull` where the disk is full.
     """
     wanted = {"version": DEMO_VERSION, "episodes": episodes, "seed": seed}
     finished = _finished_sets(root, wanted)
@@ -119,7 +120,7 @@ _SETS: Final[dict[str, Write]] = {
 
 
 def _finished_sets(root: Path, wanted: dict[str, int]) -> list[str]:
-    """The sets already there as wanted, after removing the demo's own that are not."""
+    """The sets that are there as wanted; the demo's sets of other params are removed."""
     refuse_foreign(root, "demo.recordings")
     path = root / MARKER
     if not path.exists():

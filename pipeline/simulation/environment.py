@@ -35,7 +35,7 @@ Shots = dict[str, tuple[float, NDArray[np.uint8]]]
 
 
 class InsertionEnvironment(gymnasium.Env[Any, NDArray[np.floating[Any]]]):
-    """One needle insertion a seed; an action (7,) is what is added to the commanded setpoint.
+    """One needle insertion a seed; an action (7,) is added to the commanded setpoint.
 
     dx dy dz in mm in the base frame, rotation in degrees in the convention of `action_rotation`,
     gripper (ignored). An observation has `state` (10, 12) and `sensor` (65, 1026), the readings of

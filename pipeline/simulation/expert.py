@@ -1,9 +1,10 @@
 """The demonstrator: a hand that sees the target and the A-scan.
 
-Align over the target at limited speed while descending to a standoff; go on down the slower, the
-farther from aligned; puncture, and stop at the target layer. Waiting is standing still, never a
-return upwards: who imitates a demonstrator that rises here and sinks there, and cannot tell the two
-apart, hovers. It acts on where the target was `REACTION_TICKS` ago, which the newest frames show.
+It aligns over the target at limited speed while it descends to a standoff; it goes on down the
+slower, the farther it is from aligned; it punctures, and stops at the target layer. It waits by
+standing still, never by rising: a policy that imitates a demonstrator that rises in one place and
+sinks in another, and cannot tell the two apart, hovers. It acts on where the target was
+`REACTION_TICKS` ago, which the newest frames show.
 """
 
 from dataclasses import dataclass
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 
 REACTION_TICKS: Final = 1
 ALIGNED_MM: Final = 0.3
-"""As near as this the needle goes down at full speed, and at `NOT_ALIGNED_MM` no more."""
+"""Distance up to which the needle goes down at full speed; from `NOT_ALIGNED_MM` on it stops."""
 NOT_ALIGNED_MM: Final = 0.8
 STANDOFF_MM: Final = 1.4
 
@@ -27,7 +28,7 @@ _SMOOTHING = 0.5
 
 @dataclass(frozen=True)
 class Percept:
-    """What the demonstrator acts on.
+    """What the demonstrator knows when it acts.
 
     `offset_mm` (2,) from needle to target; `distance_mm` from tip to surface and `layer_mm` from
     tip to target layer; `inside` the tissue; `turn_deg` (3,) rotation vector to the upright;

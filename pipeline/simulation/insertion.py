@@ -45,7 +45,7 @@ STATE_HZ: Final = 100
 HUB_MM: Final = 8.0
 """Height of the needle's hub above its tip."""
 ENCODER_NOISE: Final = 0.002
-"""Of every joint and pose reading, mm and degrees."""
+"""Standard deviation of every joint and pose reading, mm and degrees."""
 
 MISS_MM: Final = 1.0
 """Largest distance from the target to the puncture, sideways."""
@@ -234,7 +234,7 @@ class NeedleInsertion:
         return ArmMotion(*np.stack(fields, axis=1)[:, tick]).at((at - tick) * TICK_S)
 
     def scene(self, time_s: float) -> Scene:
-        """What the cameras see at a time of the episode so far."""
+        """The scene at a time of the episode so far."""
         at = min(max(time_s * TICK_HZ, 0.0), len(self.knots) - 1.0)
         first = min(int(at), len(self.knots) - 2)
         before, after = self.knots[first : first + 2]

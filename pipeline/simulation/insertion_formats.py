@@ -28,7 +28,7 @@ from pipeline.simulation.rendering import JPEG_QUALITY, VIEWS
 
 INSTRUCTION: Final = "Insert the needle at the red point"
 ABUTTING, OVERLAPPING = (65, 65), (650, 130)
-"""Readings in a window of the new format, and readings between windows."""
+"""Readings in a window of the new format, and from one window to the next."""
 
 _CAMERAS: Final = {
     "View1": "zed_41182735_left",
@@ -104,7 +104,7 @@ def write_new(
 
 
 def write_old(task: Path, episode: SimulatedEpisode) -> None:
-    """Write `recv_all_<stamp>/`: actions and sensor at 10 Hz in a pickle, on no clock."""
+    """Write `recv_all_<stamp>/`: actions and sensor at 10 Hz in a pickle, without a clock."""
     folder = task / f"recv_all_{episode.stamp}"
     # Rows count from the earliest frame's name, so the first camera begins in time with them.
     start = float(np.ceil(episode.epoch_s * 1000)) / 1000

@@ -1,4 +1,4 @@
-"""What the needle measures: the force along it, and an OCT A-scan that looks ahead of its tip.
+"""The needle's sensor: the force along it, and an OCT A-scan ahead of its tip.
 
 An A-scan is 1,025 bins of 5 µm, counted from the tip, in whole counts of an 8-bit digitiser.
 Outside the tissue nothing is brighter than its surface, a peak at the tip-to-tissue distance, with
@@ -8,8 +8,8 @@ Beyond the last bin nothing is seen.
 
 Scattered light carries speckle, a grain that is fixed to the tissue and drawn anew for each episode
 (Schmitt, Xiang, Yung, "Speckle in optical coherence tomography", J. Biomed. Opt. 4(1), 1999). The
-gain drifts, the digitiser saturates, scans come late, and some are lost: the reader then repeats
-the last.
+gain drifts, the digitiser saturates, scans come late, and some are lost: then the last scan is
+repeated.
 """
 
 from dataclasses import dataclass
@@ -41,7 +41,7 @@ _OFFSETS: Final = np.arange(-_ORIGIN, 2 * A_SCAN_BINS + 1)
 
 @dataclass(frozen=True)
 class NeedleContact:
-    """How needle and tissue stand to each other, a row a reading.
+    """Where the needle is relative to the tissue, one row a reading.
 
     `distance_mm` from the tip to the surface, 0 in contact; `layer_mm` from the tip to the target
     layer; `inside` whether the surface is punctured; `force_n` along the needle.
@@ -65,7 +65,7 @@ class NeedleSensor:
     def read(
         self, contact: NeedleContact, start_s: float, rng: np.random.Generator
     ) -> NDArray[np.float32]:
-        """Readings (row, 1026) that follow those read before, at 650 Hz: force in N, then A-scan.
+        """The next readings (row, 1026) at 650 Hz: force in N, then A-scan.
 
         The number of rows is a multiple of `READINGS_PER_SCAN`. The force drifts slowly.
         """
@@ -108,7 +108,7 @@ class NeedleSensor:
 
 
 def distance_bin(distance_mm: NDArray[np.float64]) -> NDArray[np.int64]:
-    """The bin nearest to a distance, far distances held a scan's length beyond the last bin."""
+    """The bin nearest to a distance; at most a scan's length beyond the last bin."""
     return np.clip(np.rint(distance_mm / BIN_MM), -A_SCAN_BINS, _ORIGIN).astype(np.int64)
 
 

@@ -37,7 +37,7 @@ class SimulatedRobot:
     ) -> None:
         self._hz, self._clock, self._scale = hz, clock, TICK_HZ / hz
         self.stopped: str | None = None
-        """Why it was told to stand still."""
+        """The reason of `stop`; None before it."""
         self._environment = InsertionEnvironment(cameras=False)
         self._unread: list[Readings] = [self._environment.reset(seed=seed)[0]]
         self._steps, self._began_s = 0, math.nan
@@ -71,7 +71,7 @@ class SimulatedRobot:
         return observed
 
     def frames(self) -> Shots:
-        """What each camera took last."""
+        """The newest frame of each camera."""
         return self._newest
 
     def act(self, action: NDArray[np.float64]) -> None:

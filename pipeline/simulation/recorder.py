@@ -1,7 +1,7 @@
-"""A simulated episode as recorders see it: each stream through a clock of its own.
+"""A simulated episode as recorders see it: each stream with its own clock.
 
-Clocks start a little after each other and jitter; the arm's readings carry the noise of its
-encoders. Times are seconds since the epoch.
+Clocks start at different times and jitter; the arm's readings have the noise of its encoders. Times
+are seconds since the epoch.
 """
 
 from collections.abc import Iterator
@@ -25,16 +25,17 @@ _LATE_S: Final = 0.08
 _ROBOT_JITTER_S, _SENSOR_JITTER_S, CAMERA_JITTER_S = 4e-4, 8e-5, 3e-3
 LOST_FRAMES = 0.01
 _START_MM = (1.8, 5.0)
-"""Heights that demonstrations begin at: some lower than a rollout does."""
+"""Bounds of the height at which demonstrations begin; some begin lower than a rollout does."""
 _NOISE_MM, _NOISE_DEG = 0.02, 0.02
-"""Of every tick's motion, in every direction."""
+"""Standard deviation of the noise of every tick's motion, in every direction."""
 _NUDGES, _NUDGE_MM = 4, (0.3, 1.2)
-"""Of the phantom in a demonstration, beside its pushes, and how far each moves the target."""
+"""Number of nudges of the phantom in a demonstration, beside its pushes, and bounds of the
+distance by which a nudge moves the target."""
 
 
 @dataclass(frozen=True)
 class SimulatedEpisode:
-    """One finished episode that began at `epoch_s`, and a generator for what its clocks do.
+    """One finished episode that began at `epoch_s`, and the generator of its clocks' jitter.
 
     `sensor` (reading, 1026) at 650 Hz, the first a reading's time after the beginning.
     """
@@ -86,7 +87,7 @@ class SimulatedEpisode:
         return self.insertion.poses(time - self.epoch_s)
 
     def frames(self, view: str, time: NDArray[np.float64]) -> Iterator[NDArray[np.uint8]]:
-        """What a camera takes at each time, one by one."""
+        """A camera's frames at these times, one by one."""
         for instant in time:
             yield photograph(view, self.insertion, float(instant) - self.epoch_s)
 
@@ -94,11 +95,10 @@ class SimulatedEpisode:
 def simulate_episode(seed: int, epoch_s: float, crosses_180: bool = False) -> SimulatedEpisode:
     """A demonstration that succeeds, of this seed or the next that does.
 
-    The demonstrator is disturbed while it corrects, so that recoveries are in the data, as in
-    Laskey et al. 2017, "DART: Noise Injection for Robust Imitation Learning". Actions come from
-    poses, so what disturbs the arm is in the labels: a little noise in every tick, of mean 0.
-    Larger misses come from nudges of the phantom, which leave the labels clean. Same arguments,
-    same episode.
+    Disturbances of the demonstrator put recoveries into the data, as in Laskey et al. 2017, "DART:
+    Noise Injection for Robust Imitation Learning". Actions come from poses, so the labels contain
+    what disturbs the arm: a little noise of mean 0 in every tick. Larger misses come from nudges of
+    the phantom, which leave the labels clean. The same arguments give the same episode.
     """
     insertion, rng = NeedleInsertion(), np.random.default_rng([seed, 202])
     layout = _nudged(draw_layout(seed, "moved", crosses_180), rng)
@@ -118,7 +118,7 @@ def simulate_episode(seed: int, epoch_s: float, crosses_180: bool = False) -> Si
 
 
 def _nudged(layout: InsertionLayout, rng: np.random.Generator) -> InsertionLayout:
-    """The layout with nudges among its pushes, and with another height to begin at."""
+    """The layout with nudges among its pushes, and with another height at the beginning."""
     start = layout.start_pose.copy()
     start[2] = layout.surfaces_mm[0] + rng.uniform(*_START_MM)
     pushes = layout.push_times_s.tolist()

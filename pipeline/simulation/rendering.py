@@ -1,4 +1,4 @@
-"""Three camera views of the bench, drawn without perspective: heights leave no trace in them.
+"""Three camera views of the bench, without perspective, so that they show no heights.
 
     View1  from the side, across the diagonal: the camera rides up and down with the arm, and a
            splash guard fixed to it hides what lies below the needle's tip. A laser plane
@@ -6,7 +6,7 @@
     View2  from above, fixed to the bench: the phantom, its sticker, and the needle held by its arm.
     View5  from the hand: the needle's tip stays in the middle of the image, the sticker moves.
 
-The views look through telecentric lenses: distance changes neither size nor place.
+The lenses are telecentric: distance changes neither size nor place.
 """
 
 from functools import cache
@@ -24,10 +24,10 @@ WIDTH: Final = 224
 HEIGHT: Final = 126
 
 JPEG_QUALITY: Final = 75
-"""Of the recorder, and so of what a policy sees."""
+"""JPEG quality of the recorder's frames, which a policy sees."""
 
 _NOISE = 2.0
-"""Of every level of a pixel."""
+"""Standard deviation of the noise of a pixel's level."""
 _OVERSAMPLING = 2
 _SIZE = np.array([WIDTH, HEIGHT]) * _OVERSAMPLING
 _MIDDLE = _SIZE / 2
@@ -41,7 +41,7 @@ _STICKER_MM, _MARK_MM = 3.6, 2.8
 _HUB_RADIUS_MM, _SHAFT_MM, _ARM_MM = 1.25, 0.55, 0.6
 _GUARD_TOP = 0.85
 _ACROSS: Final = np.array([1.0, 1.0]) / np.sqrt(2.0)
-"""What the side camera shows to the right, in x and y of the bench."""
+"""The direction to the right in the side camera's image, in x and y of the bench."""
 
 _BENCH, _WALL, _GUARD = (96, 104, 112), (206, 212, 216), (58, 62, 68)
 _SKIN, _SKIN_EDGE = (232, 190, 168), (196, 146, 124)
@@ -61,7 +61,7 @@ def render(view: str, scene: Scene) -> NDArray[np.uint8]:
 
 
 def photograph(view: str, insertion: NeedleInsertion, time_s: float) -> NDArray[np.uint8]:
-    """What a camera takes at a time of the episode so far: the image with the camera's noise.
+    """A camera's frame at a time of the episode so far: the image with the camera's noise.
 
     The same episode, view and time give the same bits.
     """
@@ -73,7 +73,7 @@ def photograph(view: str, insertion: NeedleInsertion, time_s: float) -> NDArray[
 
 
 def through_jpeg(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """The image as a recording of it gives it back."""
+    """The image as it is read from a recording."""
     file = BytesIO()
     Image.fromarray(image).save(file, "JPEG", quality=JPEG_QUALITY)
     return np.asarray(Image.open(file))
@@ -81,7 +81,7 @@ def through_jpeg(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 @cache
 def _exposure(brightness: float) -> NDArray[np.uint8]:
-    """What each of the 256 levels becomes."""
+    """(256,) the level that each level becomes."""
     return np.minimum(np.rint(np.arange(256) * brightness), 255).astype(np.uint8)
 
 
@@ -125,7 +125,7 @@ def _phantom(draw: _Draw, middle_mm: _Point, target_mm: _Point, px_mm: float) ->
 
 
 def _pixels(place_mm: _Point, px_mm: float) -> _Point:
-    """Of a place counted from what stands in the middle: x to the right, y upwards."""
+    """The pixel of a place relative to the middle of the image: x to the right, y upwards."""
     return _MIDDLE + px_mm * place_mm * [1.0, -1.0]
 
 

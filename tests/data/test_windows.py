@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipeline.base.errors import RecordingError
-from pipeline.data.windows import rebuild
+from pipeline.data.windowed import rebuild
 
 
 def cut(values: np.ndarray, time: np.ndarray, width: int, stride: int):
