@@ -29,7 +29,7 @@ from pipeline.train.log import check_loggers
 from pipeline.train.loop import Trainer
 from pipeline.train.run import open_run, run_lock
 from pipeline.train.split import split_by_episode
-from pipeline.train.tuned_episodes import refuse_tuned_episodes
+from pipeline.train.training_data import refuse_tuned_episodes
 from pipeline.train.world import process_device, process_group
 
 

@@ -29,7 +29,7 @@ from pipeline.base.config import Params
 from pipeline.store import FeatureStore, check_trailers
 from pipeline.train.run import finished_run, open_run, run_lock
 from pipeline.train.split import split_by_episode
-from pipeline.train.tuned_episodes import refuse_tuned_episodes
+from pipeline.train.training_data import refuse_tuned_episodes
 
 
 def main(params: Params) -> None:

@@ -22,7 +22,7 @@ from pipeline.store import Batch, FeatureStore, episode_name
 from pipeline.train.batches import NO_LAGS, BatchIndices, Lags, Prefetch, Ticks, Windows, evenly
 from pipeline.train.predictions import FeedMaker, predict
 from pipeline.train.scores import Comparison, action_space, compare
-from pipeline.train.split import groups_of
+from pipeline.train.training_data import groups_of
 
 DELAYS_MS = (50, 100, 200)
 MOST_TICKS = 1000

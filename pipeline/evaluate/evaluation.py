@@ -23,7 +23,8 @@ from pipeline.train.batches import Windows
 from pipeline.train.predictions import Predictions, predict
 from pipeline.train.run import FREE_PARAMS
 from pipeline.train.scores import Comparison, action_space, compare
-from pipeline.train.split import find_ticks, groups_of, hash64, source_of
+from pipeline.train.split import hash64
+from pipeline.train.training_data import find_ticks, groups_of, source_of
 
 JUDGED = "judged.json"
 """Its name in the folder of an evaluation, beside metrics.json."""

@@ -40,8 +40,9 @@ from pipeline.train.progress import Progress, describe_data, peak_memory_bytes
 from pipeline.train.run import TrainingRun, policy_shape
 from pipeline.train.sampling import Plan, StepPart
 from pipeline.train.scores import action_space, compare
-from pipeline.train.split import Split, source_of, split_parts
+from pipeline.train.split import Split
 from pipeline.train.statistics import fit_normalization
+from pipeline.train.training_data import source_of, split_parts
 from pipeline.train.world import World, deferred_interrupt, process_device
 
 LOG_EVERY = 10

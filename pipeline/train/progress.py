@@ -17,7 +17,8 @@ from pipeline.policy.observation import PolicyShape
 from pipeline.store import FeatureStore
 from pipeline.train.batches import Prefetch
 from pipeline.train.sampling import ticks_by_source
-from pipeline.train.split import Split, split_parts
+from pipeline.train.split import Split
+from pipeline.train.training_data import split_parts
 
 EVERY_S = 60.0
 """Between two lines where there is no terminal."""

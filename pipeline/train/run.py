@@ -43,7 +43,7 @@ from pipeline.policy.document import PolicyDocument
 from pipeline.policy.normalization import Normalization
 from pipeline.policy.shape import PolicyShape, channel_kinds
 from pipeline.store import FeatureStore, build_lock
-from pipeline.train.split import list_differences, source_of
+from pipeline.train.training_data import list_differences, source_of
 
 RUN, BEST, LAST = "run.json", "best", "last"
 TRAINER_WEIGHTS, TRAINER_DOCUMENT = "trainer.safetensors", "trainer.json"

@@ -10,7 +10,7 @@ from pipeline.base.digests import ContentDigests, ledger_path
 from pipeline.base.errors import RecordingError, StoreMismatch
 from pipeline.data import Opened, Recording, content_digest, open_recordings
 from pipeline.store import Episode, FeatureStore, episode_name
-from pipeline.train.split import list_differences
+from pipeline.train.training_data import list_differences
 from pipeline.vlm.feature_spec import FeatureSpec, feature_spec
 
 _SHOWN = 5

@@ -25,8 +25,8 @@ from pipeline.train.loop import Trainer
 from pipeline.train.predictions import predict
 from pipeline.train.run import open_run
 from pipeline.train.scores import action_space, compare
-from pipeline.train.split import check_store, find_ticks, split_by_episode
-from pipeline.train.tuned_episodes import refuse_tuned_episodes
+from pipeline.train.split import split_by_episode
+from pipeline.train.training_data import check_store, find_ticks, refuse_tuned_episodes
 from pipeline.vlm.feature_spec import feature_spec
 
 CPU = torch.device("cpu")
