@@ -27,10 +27,10 @@ from pipeline.store import FeatureStore, check_trailers
 from pipeline.train.finetuning import LiveFeatures, head_params, next_steps, out_of_memory_named
 from pipeline.train.log import check_loggers
 from pipeline.train.loop import Trainer
+from pipeline.train.process_group import process_device, process_group
 from pipeline.train.run import open_run, run_lock
 from pipeline.train.split import split_by_episode
 from pipeline.train.training_data import refuse_tuned_episodes
-from pipeline.train.world import process_device, process_group
 
 
 def main(params: Params) -> None:

@@ -45,7 +45,7 @@ def _train(params: Params) -> None:
     # With torch, which takes over a second to import.
     from pipeline.train.log import check_loggers
     from pipeline.train.loop import Trainer
-    from pipeline.train.world import process_group
+    from pipeline.train.process_group import process_group
 
     head = params.train_head
     with process_group(head.device) as world:

@@ -16,8 +16,8 @@ from pipeline.policy.checkpoint import load_policy
 from pipeline.policy.document import Sha256
 from pipeline.policy.normalization import Normalization
 from pipeline.policy.observation import PolicyShape
+from pipeline.train.process_group import ProcessGroup
 from pipeline.train.run import TRAINER_DOCUMENT, TRAINER_WEIGHTS, TrainingRun
-from pipeline.train.world import World
 
 
 class TrainerState(Document):
@@ -82,7 +82,7 @@ def load_weights(
 
 
 def read_last(
-    run: TrainingRun, world: World
+    run: TrainingRun, processes: ProcessGroup
 ) -> tuple[Normalization, PolicyShape, TrainerState, dict[str, Tensor]]:
     """What a run goes on from, read on rank 0 and sent to the others.
 
@@ -96,4 +96,4 @@ def read_last(
         tensors.update(own)  # not pickled with the rest, but sent one by one
         return checkpoint.normalization, checkpoint.shape, state
 
-    return *world.shared(read), world.tensors(tensors)
+    return *processes.shared(read), processes.tensors(tensors)

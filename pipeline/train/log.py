@@ -21,8 +21,8 @@ from pipeline.base.config import TrainHeadParams
 from pipeline.base.durable import disk_full_named, fresh
 from pipeline.base.errors import ConfigError
 from pipeline.base.ownership import REPORT, OutputKind, begins_with, claim, refuse_foreign
+from pipeline.train.process_group import ProcessGroup
 from pipeline.train.progress import Pace
-from pipeline.train.world import World
 
 FINISH_TIMEOUT_S = 120.0
 """How long a finished run waits for Weights & Biases to take what it has not sent yet."""
@@ -302,7 +302,7 @@ class TrainingLog(AbstractContextManager["TrainingLog"]):
 
 @contextmanager
 def open_log(
-    params: TrainHeadParams, resumed: bool, earlier: Iterable[Row], world: World
+    params: TrainHeadParams, resumed: bool, earlier: Iterable[Row], processes: ProcessGroup
 ) -> Generator[TrainingLog | None]:
     """Rank 0's log, to the loggers of `params`, which says where to look; None on the others.
 
@@ -315,7 +315,7 @@ def open_log(
             with disk_full_named(params.logs):
                 loggers = open_loggers(params, resumed)
             opened.append(stack.enter_context(TrainingLog(params.logs, loggers, earlier)))
-            world.say(*(logger.note for logger in loggers))
+            processes.say(*(logger.note for logger in loggers))
 
-        world.shared(begin)
+        processes.shared(begin)
         yield opened[0] if opened else None

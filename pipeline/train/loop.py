@@ -36,6 +36,7 @@ from pipeline.train.optimizer import (
     trainable,
 )
 from pipeline.train.predictions import predict
+from pipeline.train.process_group import ProcessGroup, deferred_interrupt, process_device
 from pipeline.train.progress import Progress, describe_data, peak_memory_bytes
 from pipeline.train.run import TrainingRun, policy_shape
 from pipeline.train.sampling import Plan, StepPart
@@ -43,7 +44,6 @@ from pipeline.train.scores import action_space, compare
 from pipeline.train.split import Split
 from pipeline.train.statistics import fit_normalization
 from pipeline.train.training_data import source_of, split_parts
-from pipeline.train.world import World, deferred_interrupt, process_device
 
 LOG_EVERY = 10
 EVALUATION_TICKS = 1000
@@ -69,11 +69,11 @@ class Trainer:
         source: FeatureSource | None = None,
     ) -> None:
         self.store, self.params, self.split, self.run = store, params, split, run
-        self.world = World.current()
+        self.processes = ProcessGroup.current()
         self.device = process_device(params.device)
         self.source = source or FeatureSource(store, *choose_feed(params.feed, store, self.device))
         self.golden = self.source.golden  # now: a damaged one stops a run before it begins
-        self.plan = Plan(store, params, split, self.world, run.section)
+        self.plan = Plan(store, params, split, self.processes, run.section)
         self.windows = Windows.of(params)
         self.step = 0
         if params.early_stopping is not None and not len(split.val):
@@ -87,7 +87,7 @@ class Trainer:
         self._earlier: Sequence[Row] = ()
         self._trained_s = 0.0
         if run.status == "resumed":
-            self.normalization, self.shape, state, tensors = read_last(run, self.world)
+            self.normalization, self.shape, state, tensors = read_last(run, self.processes)
             self._build()
             load_weights(self.learning, of_kind(tensors, "weights"), run.last)
             load_weights(self.average.weights, of_kind(tensors, "average"), run.last)
@@ -97,7 +97,7 @@ class Trainer:
             self.step, self._earlier, self._trained_s = state.step, state.rows, state.trained_s
         else:
             fitted = partial(fit_normalization, store, split.train, self.windows)
-            self.normalization = self.world.shared(fitted)
+            self.normalization = self.processes.shared(fitted)
             self.shape = policy_shape(store, self.normalization)
             self._build()
 
@@ -112,7 +112,7 @@ class Trainer:
         self.module = self.source.attach(policy).to(self.device).train()
         self.learning = trainable(self.module)
         """The parameters that learn, by name; the others are neither averaged nor kept."""
-        self.world.spread(value.data for value in self.learning.values())
+        self.processes.spread(value.data for value in self.learning.values())
         rates = peak_rates(self.module, self.source, params)
         self.optimizer = make_optimizer(self.module, params, rates)
         self.average = WeightAverage(self.module, params.ema_decay)
@@ -139,15 +139,15 @@ class Trainer:
         ticks. On Ctrl-C or SIGTERM, to whichever process, all end the step, the last checkpoint is
         written and `KeyboardInterrupt` raised.
         """
-        steps, shown = range(self.step, self.params.max_steps), self.world.first
+        steps, shown = range(self.step, self.params.max_steps), self.processes.first
         resumed = self.run.status == "resumed"
         with (
             deferred_interrupt() as interrupted,
-            open_log(self.params, resumed, self._earlier, self.world) as log,
+            open_log(self.params, resumed, self._earlier, self.processes) as log,
             self.source.feed(self.plan.parts_of(steps), self.windows, self.device) as feed,
             Progress(feed, self.device, steps, self._trained_s, shown) as progress,
         ):
-            self.world.shared(self.run.begin)
+            self.processes.shared(self.run.begin)
             batches = iter(feed)
             while not self._over:
                 stopped = self._train_step(batches, interrupted)
@@ -160,13 +160,13 @@ class Trainer:
                     self._save_last(log, progress)
                 if stopped and not self._over:
                     raise KeyboardInterrupt
-        self.world.shared(self.run.finish)
+        self.processes.shared(self.run.finish)
         if self.stopping.exhausted:
             stalled = self.stopping.stalled
-            self.world.say(
+            self.processes.say(
                 f"stopped early at step {self.step}: {stalled} evaluations without a better one"
             )
-        self.world.say(
+        self.processes.say(
             f"trained {self.step} steps in {duration(progress.trained_s)} "
             f"({self.step / max(progress.trained_s, 1e-9):.1f} steps/s), "
             f"peak memory {size(peak_memory_bytes(self.device))}"
@@ -182,7 +182,7 @@ class Trainer:
         whole = sum(value.numel() for value in self.module.parameters())
         if learning < whole:
             lines.append(f"learns {learning:,} of {whole:,} parameters")
-        several = f" on {self.world.size} processes" if self.world.size > 1 else ""
+        several = f" on {self.processes.size} processes" if self.processes.size > 1 else ""
         precision = "bfloat16 autocast" if self._bfloat16 else "float32"
         return [
             *lines,
@@ -223,7 +223,7 @@ class Trainer:
             for name, value in self._backward(part, batch).items():
                 scalars[name] = scalars[name] + value if name in scalars else value
         learning = self.learning.values()
-        stopped = self.world.sum_gradients(learning, scalars, interrupted())
+        stopped = self.processes.sum_gradients(learning, scalars, interrupted())
         norm = torch.nn.utils.clip_grad_norm_(learning, self.params.grad_clip)
         self.optimizer.step()
         self.average.update(self.step + 1)
@@ -256,22 +256,22 @@ class Trainer:
             log.write_speed(self.step, pace)
             progress.show(pace, means["loss"], rate)
 
-        self.world.shared(write)
+        self.processes.shared(write)
 
     def _evaluate(self, log: TrainingLog | None, progress: Progress) -> None:
         """Evaluate the averaged weights; save them where they are the best so far."""
         self._check_finite()
         with progress.paused():
-            metrics = self.world.shared(lambda: self._measure(log))
+            metrics = self.processes.shared(lambda: self._measure(log))
             best = not metrics or self.stopping.take(metrics["val/error"])
-            if metrics and self.world.first:
+            if metrics and self.processes.first:
                 tqdm.write(
                     f"step {self.step}: train loss {self.history.last('loss'):.4f}, val error "
                     f"{metrics['val/error']:.4f} of the training std"
                     f"{' (best so far)' if best else ''}"
                 )
             if best:
-                self.world.shared(lambda: self._save(self.run.best, metrics))
+                self.processes.shared(lambda: self._save(self.run.best, metrics))
 
     def _measure(self, log: TrainingLog | None) -> dict[str, float]:
         """The metrics on val, written down; none where that is empty. Test is never looked at.
@@ -335,7 +335,7 @@ class Trainer:
             self._save(self.run.last, {"train/loss": self.history.last("loss")}, write_state)
 
         with progress.paused():
-            self.world.shared(save)
+            self.processes.shared(save)
 
     def _save(
         self,

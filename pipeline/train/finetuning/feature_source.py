@@ -27,7 +27,7 @@ from pipeline.train.finetuning.recordings import (
     known_digests,
 )
 from pipeline.train.finetuning.rows import LiveFeed, LiveRows
-from pipeline.train.world import World
+from pipeline.train.process_group import ProcessGroup
 from pipeline.vlm.feature_spec import FeatureSpec, feature_spec
 from pipeline.vlm.live import LiveVLM
 from pipeline.vlm.preparation import Preparer
@@ -56,7 +56,7 @@ class LiveFeatures(FeatureSource):
             return spec
 
         # Once for all processes: they would read the same files and say the same.
-        self._spec = World.current().shared(checked)
+        self._spec = ProcessGroup.current().shared(checked)
         self._vlm, self._finetune = params.vlm, params.finetune
         self._device = device
         self._rows = LiveRows(store, recordings, Preparer(params.vlm, self._spec))
