@@ -68,8 +68,8 @@ not alone: `parts`, accumulation times processes, stands for the last."""
 NOTHING: Mapping[str, Any] = MappingProxyType({})
 
 
-class Decides(Document):
-    """What of all that decided a run's numbers is used beyond being compared."""
+class RunInputs(Document):
+    """What decided the numbers of a run; only `recordings` is read, the rest is compared."""
 
     recordings: dict[Text, JsonValue]
 
@@ -78,7 +78,7 @@ class RunDocument(Document):
     """The content of `run.json`."""
 
     source: SourceDocument
-    decides: Decides
+    decides: RunInputs
 
 
 @dataclass(frozen=True)

@@ -5,10 +5,10 @@ store's batches, `feature_source` stands before the policy in the one training l
 """
 
 from pipeline.train.finetuning.feature_source import (
-    LiveFeatures,
+    ModelFeatureSource,
     head_params,
     next_steps,
     out_of_memory_named,
 )
 
-__all__ = ["LiveFeatures", "head_params", "next_steps", "out_of_memory_named"]
+__all__ = ["ModelFeatureSource", "head_params", "next_steps", "out_of_memory_named"]

@@ -37,7 +37,7 @@ _FREE_TUNING = {"gradient_checkpointing"}
 """What of the tuning decides no number."""
 
 
-class LiveFeatures(FeatureSource):
+class ModelFeatureSource(FeatureSource):
     """Features from a model that learns, over a store's recordings."""
 
     def __init__(self, store: FeatureStore, params: Params, device: torch.device) -> None:
