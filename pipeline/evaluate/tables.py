@@ -15,6 +15,7 @@ from pipeline.evaluate.ablation import AblationStudy
 from pipeline.evaluate.baselines import METHODS
 from pipeline.evaluate.evaluation import Evaluation
 from pipeline.evaluate.figures import (
+    FEWEST_GROUPS,
     NO_INTERVAL,
     Figure,
     Rivalry,
@@ -22,10 +23,10 @@ from pipeline.evaluate.figures import (
     by_group,
     error,
     rivalry,
+    rounded,
     sums_by_group,
+    with_unit,
 )
-from pipeline.evaluate.intervals import FEWEST_GROUPS
-from pipeline.evaluate.names import rounded, with_unit
 from pipeline.evaluate.phases import PHASE_RULE, PHASES
 from pipeline.evaluate.samples import BEST, ENERGY, MEAN
 from pipeline.store import FeatureStore

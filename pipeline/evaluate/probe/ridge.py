@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
 
 from pipeline.base.errors import NumericsError
-from pipeline.evaluate.figures import Figure
-from pipeline.evaluate.intervals import bootstrap_means
+from pipeline.evaluate.figures import Figure, bootstrap_means
 from pipeline.evaluate.probe.folds import ProbeFolds
 from pipeline.evaluate.probe.inputs import Inputs
 

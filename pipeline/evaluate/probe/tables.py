@@ -8,8 +8,7 @@ import numpy as np
 
 from pipeline.base.durable import write_document
 from pipeline.base.table import Table
-from pipeline.evaluate.figures import Figure
-from pipeline.evaluate.names import rounded
+from pipeline.evaluate.figures import Figure, rounded
 from pipeline.evaluate.probe.study import ProbeResult, ProbeStudy, ranked, recommend
 
 TOP = 12

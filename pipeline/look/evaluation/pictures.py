@@ -14,8 +14,7 @@ from pipeline.evaluate.ablation import AblationStudy
 from pipeline.evaluate.baselines import METHODS
 from pipeline.evaluate.curves import TrainingCurves
 from pipeline.evaluate.figures import Figure as Error
-from pipeline.evaluate.figures import best_baseline, error
-from pipeline.evaluate.names import with_unit
+from pipeline.evaluate.figures import best_baseline, error, with_unit
 from pipeline.evaluate.tables import HEADINGS
 from pipeline.look.page.style import (
     INK,
