@@ -12,8 +12,13 @@ from pipeline.base.observation import Observation
 from pipeline.policy.cost import describe_cost, flop_table
 from pipeline.policy.denoiser import Denoiser
 from pipeline.policy.diffusion import DiffusionActionExpert
+from pipeline.policy.encoders import (
+    FeatureEncoder,
+    ForceAwareSensorEncoder,
+    RobotStateEncoder,
+    SensorEncoder,
+)
 from pipeline.policy.expert import ActionExpert, GroupedLoss
-from pipeline.policy.feature_encoder import FeatureEncoder
 from pipeline.policy.flow_matching import FlowMatchingActionExpert
 from pipeline.policy.fusion import (
     ConcatFusion,
@@ -27,11 +32,6 @@ from pipeline.policy.noise_schedule import NoiseSchedule
 from pipeline.policy.observation import PolicyShape
 from pipeline.policy.policy import Normalizer, Policy, Trainable
 from pipeline.policy.regression import RegressionActionExpert
-from pipeline.policy.window_encoders import (
-    ForceAwareSensorEncoder,
-    RobotStateEncoder,
-    SensorEncoder,
-)
 
 _LIVE = {
     "QwenVLAUnified",

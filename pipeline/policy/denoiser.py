@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from pipeline.policy.attention import Projected, TransformerLayer, learned
-from pipeline.policy.tensors import Chunk, Context, StepMask
+from pipeline.policy.expert import Chunk, Context, StepMask
 
 FREQUENCIES = 64
 """Pairs of sine and cosine that a time is written in."""

@@ -8,7 +8,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from pipeline.policy.attention import TransformerLayer, learned
-from pipeline.policy.tensors import Context
+from pipeline.policy.expert import Context
 
 Tokens = Mapping[str, Float[Tensor, "batch _ _"]]
 Shapes = Mapping[str, tuple[int, int]]

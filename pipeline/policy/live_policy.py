@@ -9,10 +9,9 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from pipeline.base.observation import Observation
-from pipeline.policy.guidance import Guide
+from pipeline.policy.expert import Chunk, Generators, Guide, Losses, StepMask
 from pipeline.policy.observation import LiveObservation, with_features
 from pipeline.policy.policy import Policy, Trainable
-from pipeline.policy.tensors import Chunk, Generators, Losses, StepMask
 
 Model = TypeVar("Model", bound=nn.Module)
 

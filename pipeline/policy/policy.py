@@ -12,11 +12,24 @@ from pipeline.base.config import TrainHeadParams
 from pipeline.base.errors import ConfigError, ObservationError
 from pipeline.base.observation import Observation
 from pipeline.policy.diffusion import DiffusionActionExpert
-from pipeline.policy.expert import ActionExpert, uniform
-from pipeline.policy.feature_encoder import FeatureEncoder
+from pipeline.policy.encoders import (
+    FeatureEncoder,
+    ForceAwareSensorEncoder,
+    RobotStateEncoder,
+    SensorEncoder,
+)
+from pipeline.policy.expert import (
+    ActionExpert,
+    Chunk,
+    Context,
+    Generators,
+    Guide,
+    Losses,
+    StepMask,
+    uniform,
+)
 from pipeline.policy.flow_matching import FlowMatchingActionExpert
 from pipeline.policy.fusion import build_fusion
-from pipeline.policy.guidance import Guide
 from pipeline.policy.normalization import ChannelStatistics, Normalization
 from pipeline.policy.observation import (
     AGES,
@@ -28,12 +41,6 @@ from pipeline.policy.observation import (
 )
 from pipeline.policy.regression import RegressionActionExpert
 from pipeline.policy.state_channels import expand
-from pipeline.policy.tensors import Chunk, Context, Generators, Losses, StepMask
-from pipeline.policy.window_encoders import (
-    ForceAwareSensorEncoder,
-    RobotStateEncoder,
-    SensorEncoder,
-)
 
 EXPERTS: dict[str, type[ActionExpert]] = {
     "regression": RegressionActionExpert,

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 
-from pipeline.policy.guidance import Guide
+from pipeline.policy.expert import Guide
 from pipeline.robot.chunking import PlanGuide
 
 
