@@ -1,4 +1,4 @@
-"""The normalisation, fitted on what training may see and nothing else."""
+"""The normalisation, fitted on the training ticks alone."""
 
 from collections.abc import Sequence
 from dataclasses import asdict, replace
@@ -24,7 +24,7 @@ from pipeline.train.batches import Ticks, Windows, evenly
 
 CHUNK_BYTES = 64 * 2**20
 _STATE_TICKS = 16_384
-"""Training ticks at most whose windows of states give the statistics of these."""
+"""Training ticks at most whose windows give the statistics of the states."""
 _AT_ONCE = 1024
 Rows = range | NDArray[np.int64]
 """Rows of one of the store's arrays."""
@@ -38,16 +38,16 @@ _ARRAYS = {"tick": "tick/action", "vl": "vl/features"} | {
 def fit_normalization(
     store: FeatureStore, ticks: Ticks, windows: Windows, threads: int | None = None
 ) -> Normalization:
-    """Statistics per channel over the training `ticks` and what was known at them.
+    """Statistics per channel over the training `ticks` and the readings before them.
 
-    Features over the VL rows that these ticks use, each once, and over all its variants alike, so
-    (slot, dim) of one variant; sensor over the readings from each episode's start to the last of
-    its ticks; states as a policy takes them (`state_channels.expand`), over the windows of at most
-    16,384 evenly spaced ticks; a stream that none of them has, has none. No spread of an input is
-    far below what is usual for inputs alike (`ChannelStatistics.floored`). Reads the store once, in
-    chunks of about 64 MB, a few at a time on `threads` threads (as many as torch has, where None),
-    with a bar on a terminal; the same bits for any number of them. Raises `NumericsError` on NaN or
-    inf, naming episode, tick or reading, time and channel.
+    Features: over the VL rows that these ticks use, each once, with all variants alike, so (slot,
+    dim). Sensor: over the readings from each episode's start to its last tick. States: as a policy
+    takes them (`state_channels.expand`), over the windows of at most 16,384 evenly spaced ticks. A
+    stream that no tick has gets no statistics. No spread is far below what is usual for similar
+    inputs (`ChannelStatistics.floored`). Reads the store once, in chunks of about 64 MB, a few at a
+    time on `threads` threads (None: as many as torch has), with a bar on a terminal. The bits do
+    not depend on the number of threads. Raises `NumericsError` on NaN or inf, naming episode, tick
+    or reading, time and channel.
     """
     threads = torch.get_num_threads() if threads is None else threads
     parts: dict[str, list[Rows]] = {
@@ -126,7 +126,7 @@ def _fit(
     try:
         return fit_channels([partial(read, rows) for rows in parts], what, threads=threads)
     except NumericsError:
-        # It knows the row of what it was given, which says nothing to who made the recordings.
+        # The error knows a row of a chunk; the user needs the place in the recordings.
         for rows in parts:
             check_finite(store, stream, rows, what, *_read(store, stream, rows))
         raise
@@ -140,8 +140,10 @@ def check_finite(
     values: NDArray[Any],
     valid: NDArray[np.bool_] | None = None,
 ) -> None:
-    """Raise `NumericsError`, naming the place, where one of the valid `values` of these rows of a
-    stream is no number; a row of `vl` stands there once for each variant."""
+    """Raise `NumericsError`, naming the place, where a valid value of these rows is not finite.
+
+    `values` has a row for each of `rows`; of `vl` one for each variant.
+    """
     bad = first_non_finite(values, valid)
     if bad is None:
         return
@@ -175,7 +177,7 @@ def _cut(store: FeatureStore, stream: str, rows: NDArray[np.int64]) -> list[Rows
 def _read(
     store: FeatureStore, stream: str, rows: Rows
 ) -> tuple[NDArray[Any], NDArray[np.bool_] | None]:
-    """The values, of features (row of one variant, slot, dim) with which slots are valid."""
+    """The values; of features (row of one variant, slot, dim), and which slots are valid."""
     array = store.array(_ARRAYS[stream])
     values = widen(array[rows.start : rows.stop] if isinstance(rows, range) else array[rows])
     if stream != "vl":
