@@ -112,8 +112,8 @@ class Experiment:
 def read_experiments(reports: Path) -> tuple[Experiment, ...]:
     """The evaluations in the folders of `reports`, ordered by expert, fusion and name.
 
-    Those whose trainings differ by the seed or the fold alone are one experiment. What else lies
-    there, such as the logs of a training, is passed over. Raises `ConfigError` where there is none,
+    Evaluations whose trainings differ by the seed or the fold alone are one experiment. Other
+    folders, such as the logs of a training, are skipped. Raises `ConfigError` where there is none,
     where one lacks a file or cannot be read, where they were not evaluated on the same ticks (all
     folds together), and where stochastic policies were not sampled alike.
     """
@@ -148,9 +148,9 @@ def best_experiment(experiments: Sequence[Experiment], span: str) -> Experiment:
 
 
 def experiment_table(experiments: Sequence[Experiment], span: str) -> Table:
-    """An experiment a row, a baseline a row; mean absolute errors and differences with intervals.
+    """A row for each experiment and baseline, with mean absolute errors and their differences.
 
-    The baseline that sees features has the lowest error that it has in any experiment.
+    The baseline that sees features has its lowest error of all experiments.
     """
     best = best_experiment(experiments, span)
     rows: list[list[Any]] = []
@@ -272,7 +272,7 @@ def _read_experiment(folder: Path) -> Experiment:
 
 
 def _read_groups(path: Path) -> tuple[tuple[str, ...], dict[str, NDArray[np.float64]]]:
-    """The names of the groups, and (group,) of each column that is compared."""
+    """The names of the groups, and the columns (group,) that are compared."""
     columns = [f"{span}_entries" for span in SPANS]
     columns += [f"{way}_{span}" for way in METHODS for span in SPANS]
     try:
@@ -293,8 +293,8 @@ def _check_shared(reports: Path, experiments: Sequence[Experiment], key: str) ->
     """Raise `ConfigError` where evaluations that have this entry of `_SHARED` differ in it."""
     alike, remedy = _SHARED[key]
     documents = [(e.name, e.judged.model_dump(mode="json")[key]) for e in experiments]
-    for (name, one), (other_name, other) in pairwise(pair for pair in documents if pair[1]):
-        if differing := differences(one, other):
+    for (name, entry), (other_name, other) in pairwise(pair for pair in documents if pair[1]):
+        if differing := differences(entry, other):
             lines = [f"  {line} ({other_name})" for line in describe(differing, f" ({name}), ")]
             raise ConfigError(
                 f"compare.reports: expected evaluations {alike} in {reports}, but:\n"
@@ -310,10 +310,10 @@ def _check_baselines(reports: Path, experiment: Experiment, other: Experiment) -
             continue
         others = other.errors[method, span]
         if errors.shape != others.shape or not np.allclose(errors, others, rtol=_SAME, atol=1e-9):
-            found, there = experiment.by_seed(span, method)[0], other.by_seed(span, method)[0]
+            own, theirs = experiment.by_seed(span, method)[0], other.by_seed(span, method)[0]
             raise ConfigError(
                 f"compare.reports: expected the same baselines in all evaluations in {reports}, "
-                f"found {method} ({SPANS[span]}) {found:.6g} in {experiment.name} and {there:.6g} "
+                f"found {method} ({SPANS[span]}) {own:.6g} in {experiment.name} and {theirs:.6g} "
                 f"in {other.name}: they were trained on other recordings. Train and evaluate all "
                 "of them on one store, or move those that do not belong away."
             )
