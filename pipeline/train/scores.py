@@ -222,9 +222,7 @@ def action_space(store: FeatureStore, normalization: Normalization) -> ActionSpa
     for index, group in enumerate(action_groups(names, units)):
         members.setdefault((group, units[index]), []).append(index)
     groups = tuple(ActionGroup(*key, tuple(dimensions)) for key, dimensions in members.items())
-    # A channel that does not vary has a scale of 1 that is not its spread.
-    scale = np.where(statistics.scale == statistics.std, statistics.std, 0.0)
-    return names, units, groups, scale
+    return names, units, groups, statistics.spread
 
 
 def compare(

@@ -1,6 +1,7 @@
 """The normalisation, fitted on the training ticks alone."""
 
-from collections.abc import Sequence
+from collections.abc import Generator, Iterable, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, replace
 from functools import partial
 from itertools import chain
@@ -33,6 +34,10 @@ Rows = range | NDArray[np.int64]
 _ARRAYS = {"tick": "tick/action", "vl": "vl/features"} | {
     stream: f"{stream}/values" for stream in ("sensor", "state")
 }
+_NAMES = {"tick": "training actions", "vl": "training features"} | {
+    stream: f"training readings of {stream}" for stream in ("sensor", "state")
+}
+"""The names of the arrays' rows in errors."""
 
 
 def fit_normalization(
@@ -86,16 +91,11 @@ def _fit_state(store: FeatureStore, ticks: Ticks, windows: Windows) -> ChannelSt
         return expand(batch.state, kinds)[real].numpy()
 
     parts = np.array_split(some, -(-len(some) // _AT_ONCE))
-    what = "training readings of state"
     blocks = (block for part in parts if len(block := read(part)))
     if (first := next(blocks, None)) is None:
         return None  # all readings are older than the window
-    try:
-        fitted = fit_channels(chain([first], blocks), what)
-    except NumericsError:
-        for rows in readings:
-            check_finite(store, "state", rows, what, *_read(store, "state", rows))
-        raise
+    with _place_named(store, "state", readings):
+        fitted = fit_channels(chain([first], blocks), _NAMES["state"])
     names = expanded_names(channels["names"], kinds)
     return _floored(fitted, names, [""] * len(names))
 
@@ -107,28 +107,31 @@ def _channels(store: FeatureStore, stream: str) -> dict[str, list[str]]:
 def _floored(
     fitted: ChannelStatistics, names: Sequence[str], units: Sequence[str]
 ) -> ChannelStatistics:
-    varying = np.where(fitted.scale == fitted.std, fitted.std, 0.0)
-    return fitted.floored(usual_spread(varying, names, units))
+    return fitted.floored(usual_spread(fitted.spread, names, units))
 
 
 def _fit(
     store: FeatureStore, stream: str, parts: list[Rows], bar: "tqdm[NoReturn]", threads: int
 ) -> ChannelStatistics:
-    what = {"tick": "training actions", "vl": "training features"}.get(
-        stream, f"training readings of {stream}"
-    )
 
     def read(rows: Rows) -> Block:
         values, valid = _read(store, stream, rows)
         bar.update(len(rows))
         return values if valid is None else (values, valid)
 
+    readings = [partial(read, rows) for rows in parts]
+    with _place_named(store, stream, parts):
+        return fit_channels(readings, _NAMES[stream], threads=threads)
+
+
+@contextmanager
+def _place_named(store: FeatureStore, stream: str, parts: Iterable[Rows]) -> Generator[None]:
+    """Within it, a `NumericsError` names the place in the recordings, not the row of a block."""
     try:
-        return fit_channels([partial(read, rows) for rows in parts], what, threads=threads)
+        yield
     except NumericsError:
-        # The error knows a row of a chunk; the user needs the place in the recordings.
         for rows in parts:
-            check_finite(store, stream, rows, what, *_read(store, stream, rows))
+            check_finite(store, stream, rows, _NAMES[stream], *_read(store, stream, rows))
         raise
 
 
