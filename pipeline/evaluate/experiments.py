@@ -153,30 +153,33 @@ def experiment_table(experiments: Sequence[Experiment], span: str) -> Table:
     The baseline that sees features has its lowest error of all experiments.
     """
     best = best_experiment(experiments, span)
-    rows: list[list[Any]] = []
+    heading = f"{SPANS[span]} [training std]"
+    rows: list[dict[str, Any]] = []
     for experiment in experiments:
         policy = experiment.judged.policy
         low, high = experiment.by_seed(span).min(), experiment.by_seed(span).max()
         baseline = experiment.best_baseline(span)
-        own = experiment.minus(experiment, span, baseline)
-        rows.append(
-            [
-                *(experiment.name, len(experiment.seeds), experiment.folds),
-                experiment.error(span).text(),
-                f"{low:.3f} to {high:.3f}" if len(experiment.seeds) > 1 else None,
-                "it is" if experiment is best else _verdict(experiment.minus(best, span)),
-                f"{_verdict(own)} ({HEADINGS[baseline]})",
-                *(policy.model_type, policy.fusion_strategy, policy.samples, policy.parameters),
-            ]
-        )
+        apart = experiment.minus(experiment, span, baseline)
+        row = {
+            "experiment": experiment.name,
+            "seeds": len(experiment.seeds),
+            "folds": experiment.folds,
+            heading: experiment.error(span).text(),
+            "over seeds": f"{low:.3f} to {high:.3f}" if len(experiment.seeds) > 1 else None,
+            "minus the best": _verdict(experiment.minus(best, span)),
+            "minus the best baseline": f"{_verdict(apart)} ({HEADINGS[baseline]})",
+            "expert": policy.model_type,
+            "fusion": policy.fusion_strategy,
+            "samples": policy.samples,
+            "parameters": policy.parameters,
+        }
+        rows.append(row | ({"minus the best": "it is"} if experiment is best else {}))
     for method in BASELINES:
         errors = (experiment.error(span, method) for experiment in experiments)
-        error = min(errors, key=lambda error: error.value)
-        rows.append([f"baseline: {HEADINGS[method]}", None, None, error.text(), *[None] * 7])
-    heads = ["experiment", "seeds", "folds", f"{SPANS[span]} [training std]", "over seeds"]
-    heads += ["minus the best", "minus the best baseline"]
-    heads += ["expert", "fusion", "samples", "parameters"]
-    return Table(heads, rows)
+        lowest = min(errors, key=lambda error: error.value).text()
+        named = {"experiment": f"baseline: {HEADINGS[method]}", heading: lowest}
+        rows.append(dict.fromkeys(rows[0]) | named)
+    return Table.of(rows)
 
 
 def experiment_csv(experiments: Sequence[Experiment]) -> Table:

@@ -141,29 +141,28 @@ def error_table(comparison: Comparison) -> Table:
 
 def difference_table(comparison: Comparison) -> Table:
     """Policy minus best baseline in each figure, and whether the difference is resolved."""
-    rows: list[list[Any]] = []
+    rows: list[dict[str, Any]] = []
     for scope, part in scopes(comparison).items():
         for group in (*part.varying_groups(), None):
             rivals = rivalry(part, group)
-            words = (scope.replace("_", " "), _heading(group), HEADINGS[rivals.best])
-            errors = (rivals.baseline.text(), rivals.difference.text("+"))
-            rows.append([*words, *errors, rivals.verdict, rivals.ratio])
-    heads = ["steps", "error", "best baseline", "its error", "policy minus it", "the policy is"]
-    return Table([*heads, "policy / best"], rows)
+            row = {"steps": scope.replace("_", " "), "error": _heading(group)}
+            row |= {"best baseline": HEADINGS[rivals.best], "its error": rivals.baseline.text()}
+            row |= {"policy minus it": rivals.difference.text("+"), "the policy is": rivals.verdict}
+            rows.append({**row, "policy / best": rivals.ratio})
+    return Table.of(rows)
 
 
 def phase_table(comparison: Comparison) -> Table:
     """Overall errors by phase, of the policy and of the baseline that is best there."""
-    rows: list[list[Any]] = []
+    rows: list[dict[str, Any]] = []
     for phase, part in by_phase(comparison).items():
-        both = rivalry(part.executed), rivalry(part)
-        cells = (
-            [r.policy.text(), f"{r.baseline.text()} {HEADINGS[r.best]}", r.verdict] for r in both
-        )
-        rows.append([phase, part.ticks, *chain(*cells)])
-    kinds = ("policy", "best baseline", "the policy is")
-    heads = (f"{scope}: {kind}" for scope in ("executed", "chunk") for kind in kinds)
-    return Table(["phase", "ticks", *heads], rows)
+        row: dict[str, Any] = {"phase": phase, "ticks": part.ticks}
+        for scope, rivals in (("executed", rivalry(part.executed)), ("chunk", rivalry(part))):
+            row[f"{scope}: policy"] = rivals.policy.text()
+            row[f"{scope}: best baseline"] = f"{rivals.baseline.text()} {HEADINGS[rivals.best]}"
+            row[f"{scope}: the policy is"] = rivals.verdict
+        rows.append(row)
+    return Table.of(rows)
 
 
 def _heading(group: ActionGroup | None) -> str:
