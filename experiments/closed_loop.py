@@ -48,7 +48,7 @@ from experiments.recipes import (
     store_settings,
 )
 from pipeline.base.config import load_params
-from pipeline.evaluate.intervals import bootstrap_means, interval
+from pipeline.evaluate.figures import bootstrap_means
 from pipeline.evaluate.rollouts import EXPERT, POLICY, SuccessRate
 
 FIGURES = ("executed", "overall")
@@ -251,7 +251,7 @@ def _table(path: Path) -> list[dict[str, str]]:
 
 def _figure(errors: NDArray[Any], counts: NDArray[Any]) -> list[float]:
     sums, entries = (errors * counts)[:, None], counts[:, None]
-    low, high = interval(bootstrap_means(sums, entries))
+    low, high = np.nanpercentile(bootstrap_means(sums, entries), [2.5, 97.5], axis=0)
     value = float(sums.sum() / entries.sum())
     return [round(float(number), 4) for number in (value, low[0], high[0])]
 

@@ -26,7 +26,7 @@ from pipeline.look.evaluation import evaluation_report
 from pipeline.look.page.writing import PAGE, write_report
 from pipeline.policy.checkpoint import PolicyCheckpoint, find_policy, load_policy
 from pipeline.store import FeatureStore, check_trailers
-from pipeline.train.split import check_store
+from pipeline.train.training_data import check_store
 
 
 def main(params: Params) -> None:

@@ -24,13 +24,18 @@ if __name__ == "__main__":  # here, for --help waits for no import below
 
 from pipeline.base.config import Params
 from pipeline.store import FeatureStore, check_trailers
-from pipeline.train.finetuning import LiveFeatures, head_params, next_steps, out_of_memory_named
+from pipeline.train.finetuning import (
+    ModelFeatureSource,
+    head_params,
+    next_steps,
+    out_of_memory_named,
+)
 from pipeline.train.log import check_loggers
 from pipeline.train.loop import Trainer
+from pipeline.train.process_group import process_device, process_group
 from pipeline.train.run import open_run, run_lock
 from pipeline.train.split import split_by_episode
-from pipeline.train.tuned_episodes import refuse_tuned_episodes
-from pipeline.train.world import process_device, process_group
+from pipeline.train.training_data import refuse_tuned_episodes
 
 
 def main(params: Params) -> None:
@@ -40,7 +45,7 @@ def main(params: Params) -> None:
         world.shared(lambda: check_loggers(head))
         store = FeatureStore.open(head.store or params.extract.store)
         with world.holding(run_lock(head)), out_of_memory_named():
-            source = LiveFeatures(store, params, process_device(head.device))
+            source = ModelFeatureSource(store, params, process_device(head.device))
             opened = world.shared(lambda: open_run(head, store, source.identity, "finetune"))
             world.say(*opened.notes)
             if opened.status == "finished":

@@ -26,8 +26,8 @@ from pipeline.base.config import Params, RolloutParams
 from pipeline.base.device import resolve_device
 from pipeline.base.durable import write_document
 from pipeline.base.ownership import REPORT, claim, refuse_foreign
-from pipeline.evaluate.rollouts import Rollouts, roll_out
-from pipeline.evaluate.served_rollouts import roll_out_served
+from pipeline.evaluate.rollout_driver import roll_out, roll_out_served
+from pipeline.evaluate.rollouts import Rollouts
 from pipeline.look.page.blocks import Report
 from pipeline.look.page.writing import write_report
 from pipeline.look.rollout import rollout_report

@@ -29,7 +29,7 @@ from pipeline.base.config import Params
 from pipeline.store import FeatureStore, check_trailers
 from pipeline.train.run import finished_run, open_run, run_lock
 from pipeline.train.split import split_by_episode
-from pipeline.train.tuned_episodes import refuse_tuned_episodes
+from pipeline.train.training_data import refuse_tuned_episodes
 
 
 def main(params: Params) -> None:
@@ -45,7 +45,7 @@ def _train(params: Params) -> None:
     # With torch, which takes over a second to import.
     from pipeline.train.log import check_loggers
     from pipeline.train.loop import Trainer
-    from pipeline.train.world import process_group
+    from pipeline.train.process_group import process_group
 
     head = params.train_head
     with process_group(head.device) as world:

@@ -1,1 +1,1 @@
-"""A policy evaluated on recordings it has not seen, beside baselines that see nothing."""
+"""A policy evaluated on unseen recordings and in simulated rollouts, beside baselines."""

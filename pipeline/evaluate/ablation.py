@@ -1,6 +1,6 @@
-"""Is a stream used? A policy evaluated again and again, with one of its streams ablated each time.
+"""Which streams a policy uses: it is evaluated again with one of its streams ablated at a time.
 
-An error that stays says that the policy does not use the stream, or that others tell it the same.
+Where the error stays, the policy does not use the stream, or other streams tell it the same.
 """
 
 from collections.abc import Callable, Generator, Iterator, Sequence
@@ -22,21 +22,21 @@ from pipeline.store import Batch, FeatureStore, episode_name
 from pipeline.train.batches import NO_LAGS, BatchIndices, Lags, Prefetch, Ticks, Windows, evenly
 from pipeline.train.predictions import FeedMaker, predict
 from pipeline.train.scores import Comparison, action_space, compare
-from pipeline.train.split import groups_of
+from pipeline.train.training_data import groups_of
 
 DELAYS_MS = (50, 100, 200)
 MOST_TICKS = 1000
-"""Test ticks evaluated: every way to ablate a stream costs a pass over them."""
+"""Test ticks at most: every way to ablate a stream costs a pass over them."""
 MOST_SAMPLES = 4
-"""Chunks a tick of a stochastic policy, whose errors are averaged, for the same reason."""
+"""Chunks a tick of a stochastic policy at most, for the same reason; their errors are averaged."""
 FIELDS = {
     stream: tuple(field.name for field in fields(Observation) if stream_of(field.name) == stream)
     for stream in ("sensor", "state", "features")
 }
-"""What belongs to each stream: its values, which of them are real, how old they are."""
+"""The fields of each stream: its values, which of them are real, how old they are."""
 
 Alter = Callable[[BatchIndices, Batch], Batch]
-"""A batch as the policy is to see it; the one it is given stays as it is."""
+"""Returns the batch that the policy sees; its argument stays as it is."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ class Ablated:
     """`zeroed`, `missing`, `shuffled` or `delayed 50 ms`."""
     comparison: Comparison
     intact: Comparison
-    """With all streams, on the same ticks: those whose episode has this one."""
+    """With all streams, on the same ticks: those whose episode has this stream."""
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ class AblationStudy:
     intact: Comparison
     ablated: tuple[Ablated, ...]
     notes: tuple[str, ...]
-    """What could not be evaluated as asked, and why."""
+    """What was not evaluated as asked, and why."""
     samples: int
     """Chunks a tick whose errors were averaged; 1 where the policy does not sample."""
 
@@ -78,11 +78,10 @@ def evaluate_ablation(
 ) -> AblationStudy | None:
     """The study of this policy, which is `checkpoint.policy()`, on these test ticks.
 
-    At most `MOST_TICKS` evenly spaced ones are taken, of those so far into their episode that the
-    longest delay stays inside it; None where there is no such tick. Of a stochastic policy, the
-    error of one chunk is averaged over `samples`, but `MOST_SAMPLES` at most. Every evaluation
-    draws from the same seed, so that the same noise stands on both sides of a difference. Raises
-    as `predict` does.
+    It takes at most `MOST_TICKS` evenly spaced ticks, only ticks from which the longest delay stays
+    inside the episode; None where there is no such tick. The error of a stochastic policy is
+    averaged over `samples` chunks, `MOST_SAMPLES` at most. Every evaluation draws from the same
+    seed, so that both sides of a difference have the same noise. Raises as `predict`.
     """
     samples = min(samples, MOST_SAMPLES) if policy.stochastic else 1
     settled = _settled(store, ticks)
@@ -134,7 +133,7 @@ def feed_maker(
     lags: Lags = NO_LAGS,
     alter: Alter | None = None,
 ) -> FeedMaker:
-    """Feeds of this store in which streams come late or are altered, once, before anyone looks."""
+    """Feeds of this store in which streams come late or are altered."""
 
     @contextmanager
     def make(plan: Sequence[BatchIndices]) -> Generator[Iterator[tuple[BatchIndices, Batch]]]:
@@ -151,7 +150,7 @@ def feed_maker(
 def _alterations(
     checkpoint: PolicyCheckpoint, store: FeatureStore, ticks: Ticks, stream: str
 ) -> tuple[dict[str, Alter], list[str]]:
-    """Ways to alter a stream at these ticks, and why one is not there or a delay not as asked."""
+    """Ways to alter a stream at these ticks, and notes on what is not evaluated as asked."""
     ways, notes = {"zeroed": zeroed(stream, checkpoint.typical(stream))}, []
     if _knows_missing(checkpoint, store, stream):
         ways["missing"] = missing(stream)
@@ -169,7 +168,7 @@ def _alterations(
 
 
 def _knows_missing(checkpoint: PolicyCheckpoint, store: FeatureStore, stream: str) -> bool:
-    """Whether training showed the policy what it is like without this stream."""
+    """Whether the policy was trained without this stream, too."""
     if getattr(checkpoint.params, f"drop_{stream}") > 0:
         return True
     if stream == "features":
@@ -184,8 +183,8 @@ def _knows_missing(checkpoint: PolicyCheckpoint, store: FeatureStore, stream: st
 def zeroed(stream: str, mean: NDArray[np.floating]) -> Alter:
     """Every value of the stream at its training mean, which the policy sees as zeros.
 
-    A raw 0 would be a reading far from all others (a pose at the robot's foot, light of no
-    intensity): the error would tell how the policy extrapolates, not what it does without knowing.
+    A raw 0 would be a reading far from all others (a pose at the robot's foot, no light): the error
+    would tell how the policy extrapolates, not how it does without the stream.
     """
 
     def alter(indices: BatchIndices, batch: Batch) -> Batch:
@@ -197,7 +196,7 @@ def zeroed(stream: str, mean: NDArray[np.floating]) -> Alter:
 
 
 def missing(stream: str) -> Alter:
-    """Nothing of the stream is real: the policy's encoder gives its embedding for that."""
+    """No reading of the stream is real: the policy's encoder gives its embedding for that."""
     valid = VALIDITY[stream]
     return lambda indices, batch: replace(batch, **{valid: torch.zeros_like(getattr(batch, valid))})
 
@@ -218,8 +217,8 @@ def exchanged(
 def donors_of(store: FeatureStore, ticks: Ticks, stream: str, seed: int = 0) -> Ticks | None:
     """For each of these ascending ticks, one of another episode among them, drawn evenly.
 
-    A tick whose episode lacks the stream gives it to nobody and keeps what it has. None where
-    fewer than two episodes have the stream.
+    A tick whose episode lacks the stream is no donor and keeps itself. None where fewer than two
+    episodes have the stream.
     """
     having = _having(store, ticks, stream)
     episode = store.episode_of(ticks)[having]
@@ -227,7 +226,7 @@ def donors_of(store: FeatureStore, ticks: Ticks, stream: str, seed: int = 0) -> 
     size = np.searchsorted(episode, episode, side="right") - first
     if len(episode) == 0 or (size == len(episode)).any():
         return None
-    # A place among the ticks of other episodes: what lies behind one's own moves up by its size.
+    # A place among the ticks of other episodes: places behind the own episode move up by its size.
     drawn = np.random.default_rng(seed).integers(0, len(episode) - size)
     drawn = np.where(drawn < first, drawn, drawn + size)
     donors = ticks.copy()
@@ -245,7 +244,7 @@ def _having(store: FeatureStore, ticks: Ticks, stream: str) -> NDArray[np.bool_]
 def delays(store: FeatureStore, stream: str) -> dict[str, Lags]:
     """The lags of `DELAYS_MS` by name.
 
-    Features go back whole VL rows, at least one: the names say the ms that this is, each once.
+    Features go back whole VL rows, at least one; the names have the ms of these rows.
     """
     if stream != "features":
         return {
@@ -257,7 +256,7 @@ def delays(store: FeatureStore, stream: str) -> dict[str, Lags]:
 
 
 def _emptied(windows: Windows, stream: str) -> list[str]:
-    """The delays beyond the seconds that a stream's window reaches back."""
+    """Notes on delays beyond the seconds that a stream's window reaches back."""
     oldest_s = vars(windows).get(f"{stream}_window_s") or np.inf
     return [
         f"{stream} delayed {ms} ms: older than its window of {1000 * oldest_s:.0f} ms, so the "
@@ -268,14 +267,14 @@ def _emptied(windows: Windows, stream: str) -> list[str]:
 
 
 def _row_ms(store: FeatureStore) -> float:
-    """Time between VL rows; where the recorded rows are the ticks, by their median step."""
+    """Time between VL rows in ms; without `action_hz`, by the ticks' median step."""
     step_s = store.tick_step() if store.action_hz is None else 1 / store.action_hz
     # Where no episode has two ticks, none can be delayed.
     return 1000 * store.vlm_reuse_count * (step_s if step_s > 0 else np.inf)
 
 
 def _settled(store: FeatureStore, ticks: Ticks) -> Ticks:
-    """The ticks at which every delay still finds something of their own episode."""
+    """The ticks from which every delay stays inside their episode."""
     episode = store.episode_of(ticks)
     time_s, row = store.array("tick/time"), store.array("tick/vl_row")
     since_s = time_s[ticks] - time_s[store.array("episode/tick_start")[episode]]

@@ -1,7 +1,7 @@
-"""What simple rules would do, fitted on training ticks: what a policy has to beat.
+"""Baselines: simple rules, fitted on training ticks, that a policy has to beat.
 
-None of them learns more than a few numbers a dimension, but one: the nearest neighbour repeats the
-recording that looked most alike. A policy that is no better than it has learnt to look up.
+They learn a few numbers a dimension, except the nearest neighbour, which repeats the most similar
+recording. A policy that is no better has only learnt to look up.
 """
 
 from collections.abc import Iterator
@@ -25,11 +25,11 @@ from pipeline.train.predictions import Actions
 BASELINES = ("zero_action", "median_action", "repeat_last", "linear_fit", "nearest_neighbour")
 METHODS = ("policy", *BASELINES)
 NEIGHBOURS = 20_000
-"""Training ticks at most among which the nearest is looked for."""
+"""Training ticks at most among which the nearest is searched."""
 _FITTED = 200_000
 """Training ticks at most that the linear fit is fitted on."""
 _WIDTH = 256
-"""Numbers at most that features are projected to."""
+"""Width at most to which features are projected."""
 _ROWS = 512
 """VL rows read at a time."""
 
@@ -59,13 +59,13 @@ class Baselines:
         self._neighbours = Neighbours(store, evenly(ticks, NEIGHBOURS), features)
 
     def act(self, ticks: Ticks) -> dict[str, Actions]:
-        """What each of `BASELINES` does at these ticks: (tick, horizon or 1, action_dim).
+        """The actions of each of `BASELINES` at these ticks: (tick, horizon or 1, action_dim).
 
         `zero_action`: no motion. `median_action`: that of the training ticks. `repeat_last`: the
         action of the tick before. `linear_fit`: a linear function of all dimensions of the two
-        actions before, by least squares for each step of the chunk. What an episode's first ticks
-        lack before them is zero where actions are deltas or velocities, and the median where they
-        are absolute: zero would be a pose far from all others. `nearest_neighbour`: the chunk of
+        actions before, by least squares for each step of the chunk. Before an episode's first tick
+        actions count as zero where they are deltas or velocities, and as the median where they are
+        absolute: zero would be a pose far from all others. `nearest_neighbour`: the chunk of
         the training tick whose newest state reading and features are most alike.
         """
         zero = np.zeros((len(ticks), 1, len(self._median)), np.float32)
@@ -88,7 +88,7 @@ class Baselines:
         return np.concatenate([*two, np.ones((len(ticks), 1))], axis=1)
 
     def _before(self, ticks: Ticks, back: int) -> Values:
-        """The action of `back` ticks before, or what stands for it at an episode's start."""
+        """The action `back` ticks before, or its replacement before the episode's start."""
         absolute = self._store.streams["action"]["kind"] == "absolute"
         start = self._median if absolute else np.zeros_like(self._median)
         first = self._store.array("episode/tick_start")[self._store.episode_of(ticks)]
@@ -99,9 +99,9 @@ class Baselines:
 class Neighbours:
     """Training ticks by their newest state reading and the features of their VL row.
 
-    Of angles the sine and the cosine count. Both are z-scored; wide features are projected at
-    random (Achlioptas 2003), which keeps distances. Each part is then scaled to the same mean
-    square length, so that both weigh equally. A tick that lacks a part has its mean, which is zero.
+    Angles count by sine and cosine. States and features are z-scored; wide features are projected
+    at random (Achlioptas 2003), which keeps distances. Both parts are then scaled to the same mean
+    square length, so that they weigh equally. A tick that lacks a part has its mean, which is zero.
     """
 
     def __init__(
@@ -109,7 +109,7 @@ class Neighbours:
     ) -> None:
         self._store, self._ticks, self._statistics = store, ticks, features
         kinds = channel_kinds(store.streams["state"]["names"], store.streams["state"]["units"])
-        # Relative to itself, as policies take it, a reading's rotation would be none.
+        # As policies take it, relative to itself, a reading would have no rotation.
         self._kinds: list[Kind] = ["deg" if kind == "rotation" else kind for kind in kinds]
         states, known = self._newest_states(ticks)
         self._scaler = StandardScaler().fit(states[known]) if states[known].size else None
@@ -126,8 +126,8 @@ class Neighbours:
         """The training tick nearest to each of these; None in a store without either stream."""
         if self._search is None:
             return None
-        found = self._search.kneighbors(self._places(ticks), return_distance=False)
-        return self._ticks[found[:, 0]]
+        nearest = self._search.kneighbors(self._places(ticks), return_distance=False)
+        return self._ticks[nearest[:, 0]]
 
     def _places(self, ticks: Ticks) -> Values:
         parts = zip(self._parts(ticks), self._lengths, strict=True)
@@ -153,7 +153,7 @@ class Neighbours:
         return expand(torch.from_numpy(states)[:, None], self._kinds)[:, 0].double().numpy(), known
 
     def _features(self, rows: NDArray[np.int64], statistics: ChannelStatistics) -> Iterator[Values]:
-        """Those of these VL rows, of the plain frames, z-scored and projected, block by block."""
+        """The plain features of these VL rows, z-scored and projected, block by block."""
         slots = self._store.feature_shape[0]
         for some in np.split(rows, range(_ROWS, len(rows), _ROWS)):
             values = widen(self._store.array("vl/features")[some][:, :slots])
@@ -166,7 +166,7 @@ class Neighbours:
 def recorded_chunks(
     store: FeatureStore, ticks: Ticks, horizon: int
 ) -> tuple[Actions, NDArray[np.bool_]]:
-    """Recorded actions (tick, horizon, action_dim), and which are not beyond the episode's end."""
+    """Recorded actions (tick, horizon, action_dim), and which lie before the episode's end."""
     end = store.array("episode/tick_start")[store.episode_of(ticks) + 1][:, None]
     ahead = ticks[:, None] + np.arange(horizon)
     return store.array("tick/action")[np.minimum(ahead, end - 1)], ahead < end

@@ -1,4 +1,4 @@
-"""What a training wrote down of its course, read back."""
+"""The curves that a training logged, read back."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -24,7 +24,7 @@ class TrainingCurve:
 
 @dataclass(frozen=True)
 class TrainingCurves:
-    """All that a training logged, or why there is nothing of it."""
+    """The curves that a training logged, or why there are none."""
 
     curves: Mapping[str, TrainingCurve]
     """By name: `train/loss`, `val/error`, `lr`, …"""
@@ -33,7 +33,7 @@ class TrainingCurves:
 
 
 def read_curves(checkpoint: PolicyCheckpoint) -> TrainingCurves:
-    """The curves of the training that a checkpoint is of, where its logs still have them."""
+    """The curves of a checkpoint's training, where its logs still have them."""
     folder = checkpoint.params.logs / "plots" / "metrics"
     files = sorted(folder.rglob("*.tsv"))
     try:
@@ -50,7 +50,7 @@ def read_curves(checkpoint: PolicyCheckpoint) -> TrainingCurves:
 
 
 def _of_another(curves: Mapping[str, TrainingCurve], checkpoint: PolicyCheckpoint) -> bool:
-    """Whether a later training wrote to the same logs: no step so late, or another error there."""
+    """Whether another training wrote the logs: they lack the checkpoint's step or its error."""
     if max(int(curve.step[-1]) for curve in curves.values()) < checkpoint.step:
         return True
     error, curve = checkpoint.metrics.get("val/error"), curves.get("val/error")

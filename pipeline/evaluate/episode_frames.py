@@ -1,7 +1,7 @@
-"""The frames that a policy's features were computed from, from the recording itself.
+"""The frames that a policy's features were computed from, read from the recording itself.
 
-A store holds no frame. It says of each episode where its recording lay and what its files held, and
-of each VL row when its frames were captured: that finds them again, or says why not.
+A store holds no frames, but the path and file digests of each episode's recording and the capture
+times of each VL row's frames.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -26,7 +26,7 @@ class EpisodeFrames:
     """Frames of one episode, or why there are none."""
 
     frames: Mapping[str, Sequence[Frame]]
-    """By view, one for each VL row that was asked for: (height, width, 3), RGB."""
+    """By view, one for each requested VL row: (height, width, 3), RGB."""
     absence: str = ""
     """One sentence where there are no frames, naming the path."""
 
@@ -34,7 +34,7 @@ class EpisodeFrames:
 def shown_ticks(store: FeatureStore, ticks: Ticks, count: int) -> Ticks:
     """At most `count` of these ticks of one episode, evenly spread.
 
-    Those at which a VL row begins, where there are such: no frame is newer than those it saw.
+    Ticks at which a VL row begins, where there are any: their frames are the newest.
     """
     rows = store.array("tick/vl_row")[ticks]
     before = store.array("tick/vl_row")[np.maximum(ticks - 1, 0)]
@@ -51,9 +51,8 @@ def read_episode_frames(
 ) -> EpisodeFrames:
     """The frames of these store-global VL rows of one episode, ascending.
 
-    A relative path of the store lies under `root`. No frame is handed out of a recording whose
-    files are not, by their digest, those that the store was made from: each of them is read whole,
-    but where `digest_of` remembers it.
+    A relative path of the store lies under `root`. A recording whose files have changed, by their
+    digests, gives no frame: each file is read whole, unless `digest_of` remembers it.
     """
     path = root / episode.path
     if not path.is_dir():
@@ -77,7 +76,7 @@ def read_episode_frames(
 def _open_recording(
     store: FeatureStore, episode: Episode, path: Path, digest_of: Callable[[Path], str]
 ) -> Recording | None:
-    """The episode's recording, with the views it was extracted with: all, or those of the store."""
+    """The episode's recording, with all views or those of the store; None where it has changed."""
     for views in (None, store.spec["views"]):
         recording = open_recording(path, episode.format, episode.id, views)
         if content_digest(recording, digest_of) == episode.content:

@@ -1,4 +1,4 @@
-"""A policy evaluated, and on what, so that two evaluations can be told to be of the same things."""
+"""A policy evaluated on its test ticks, and the document that says on what."""
 
 import json
 from collections.abc import Callable, Mapping
@@ -23,7 +23,8 @@ from pipeline.train.batches import Windows
 from pipeline.train.predictions import Predictions, predict
 from pipeline.train.run import FREE_PARAMS
 from pipeline.train.scores import Comparison, action_space, compare
-from pipeline.train.split import find_ticks, groups_of, hash64, source_of
+from pipeline.train.split import hash64
+from pipeline.train.training_data import find_ticks, groups_of, source_of
 
 JUDGED = "judged.json"
 """Its name in the folder of an evaluation, beside metrics.json."""
@@ -31,10 +32,10 @@ JUDGED = "judged.json"
 
 @dataclass(frozen=True)
 class Evaluation:
-    """A policy that was evaluated, and all that is known of it."""
+    """A policy and the results of its evaluation."""
 
     name: str
-    """Of the checkpoint, as the user called it."""
+    """Of the checkpoint, as the user wrote it."""
     checkpoint: PolicyCheckpoint
     store: FeatureStore
     comparison: Comparison
@@ -46,7 +47,7 @@ class Evaluation:
     """`judged_document`."""
     curves: TrainingCurves
     recordings: Path
-    """Below which a relative path of the store lies."""
+    """The root of the relative paths of the store's recordings."""
 
 
 def evaluate_checkpoint(
@@ -60,8 +61,8 @@ def evaluate_checkpoint(
 ) -> Evaluation:
     """The policy of the checkpoint in `folder`, on its test ticks of a store it fits.
 
-    `say` is told first what is evaluated on what. Raises `ConfigError` where more steps would be
-    executed than a chunk has, `CheckpointMismatch` as `find_ticks` does, and `NumericsError` as
+    `say` first prints what is evaluated on what. Raises `ConfigError` where more steps would be
+    executed than a chunk has, `CheckpointMismatch` as `find_ticks`, and `NumericsError` as
     `predict`.
     """
     horizon = checkpoint.params.horizon
@@ -114,7 +115,7 @@ def evaluate_checkpoint(
 
 
 def trained_on_too(checkpoint: PolicyCheckpoint) -> str:
-    """That test ticks are of episodes which were trained on before them; empty where none are."""
+    """A note on test episodes whose earlier ticks were trained on; empty where there are none."""
     both = checkpoint.split["test"].keys() & checkpoint.split["train"].keys()
     return (
         f"{len(both)} test episode(s) were cut by time and trained on before that: "
@@ -129,11 +130,10 @@ def judged_document(
 ) -> dict[str, Any]:
     """What was evaluated (`policy`), how it was sampled (`drawn`) and on what (`on`), as JSON.
 
-    `on` is equal for all evaluations whose errors may stand in one table, whatever features the
-    policies saw: which are better is a question to ask. `drawn` is equal for those
-    of stochastic policies: the best of fewer samples errs more, and a batch shares its noise. It
-    is null for policies that do not sample. The `recipe` of a policy is equal for trainings that
-    differ by their seed or their fold alone.
+    Evaluations may stand in one table where their `on` is equal, whatever features the policies
+    saw, and where `drawn` is equal too among stochastic policies: the best of fewer samples errs
+    more, and a batch shares its noise. `drawn` is null for policies that do not sample. The
+    `recipe` is equal for trainings that differ by their seed or fold alone.
     """
     params = checkpoint.params
     source = source_of(store)

@@ -3,14 +3,14 @@
 import csv
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from itertools import chain, pairwise
 from pathlib import Path
 from typing import Annotated, Any, get_args
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, JsonValue
+from pydantic import ConfigDict, Field, JsonValue
 
 from pipeline.base.border import Border, Document, Text
 from pipeline.base.config import FusionStrategy, ModelType
@@ -23,7 +23,7 @@ from pipeline.evaluate.figures import Figure, draws
 from pipeline.evaluate.tables import GROUPS, HEADINGS
 
 SPANS = {"executed": "what is executed", "overall": "the whole chunk"}
-"""What of a chunk an error is of: its name in `GROUPS`, and in words."""
+"""The parts of a chunk that are judged: the name in `GROUPS`, and the words for it."""
 _SAME = 1e-4
 """Relative difference of two baselines that rounding on another machine explains."""
 _OF_FEATURES = "nearest_neighbour"
@@ -32,7 +32,7 @@ _SHARED = {
     "on": ("on the same test ticks, all folds together,", "recordings and folds"),
     "drawn": ("from as many samples and ticks a batch", "evaluate.samples and evaluate.batch_size"),
 }
-"""By key of `JUDGED`: how evaluations in one table are alike, and by what they become so."""
+"""By key of `JudgedDocument`: what evaluations in one table share, and what makes them share it."""
 
 
 _REPORT = Border(
@@ -51,16 +51,18 @@ class JudgedPolicy(Document):
     samples: Annotated[int, Field(ge=1)]
     seed: int
     recipe: Text
+    """Equal for trainings that differ by their seed or fold alone."""
 
 
 class JudgedOn(Document):
-    """On what it was judged."""
+    """What it was evaluated on; all entries are compared."""
 
-    test: dict[Text, Any]
+    model_config = ConfigDict(extra="allow")
+    test: dict[Text, JsonValue]
 
 
 class JudgedDocument(Document):
-    """The content of `JUDGED`."""
+    """The content of `JUDGED`, as `judged_document` writes it."""
 
     policy: JudgedPolicy
     on: JudgedOn
@@ -72,21 +74,15 @@ class Experiment:
     """The evaluations, read back, of policies whose training differs by its seed or fold alone."""
 
     name: str
-    model_type: str
-    fusion_strategy: str
-    recipe: str
-    """Equal where but the seed or the fold differs."""
+    judged: JudgedDocument
+    """Of the first of them; its test is that of all folds."""
     seeds: tuple[int, ...]
-    parameters: int
-    samples: int
     groups: tuple[str, ...]
     """Of test recordings, in order; those of all folds."""
     entries: Mapping[str, NDArray[np.float64]]
     """Of each of `SPANS`: (group,) recorded actions that were judged."""
     errors: Mapping[tuple[str, str], NDArray[np.float64]]
     """Of each of `METHODS` in each of `SPANS`: (seed, group) mean absolute error [training std]."""
-    judged: Mapping[str, Any] = field(default_factory=dict[str, Any])
-    """What `JUDGED` says by key of `_SHARED`."""
     folds: int = 1
     """Evaluations that are test for other groups each, and taken together."""
 
@@ -116,8 +112,8 @@ class Experiment:
 def read_experiments(reports: Path) -> tuple[Experiment, ...]:
     """The evaluations in the folders of `reports`, ordered by expert, fusion and name.
 
-    Those whose trainings differ by the seed or the fold alone are one experiment. What else lies
-    there, such as the logs of a training, is passed over. Raises `ConfigError` where there is none,
+    Evaluations whose trainings differ by the seed or the fold alone are one experiment. Other
+    folders, such as the logs of a training, are skipped. Raises `ConfigError` where there is none,
     where one lacks a file or cannot be read, where they were not evaluated on the same ticks (all
     folds together), and where stochastic policies were not sampled alike.
     """
@@ -134,25 +130,15 @@ def read_experiments(reports: Path) -> tuple[Experiment, ...]:
         )
     runs: dict[tuple[Any, ...], list[Experiment]] = {}
     for experiment in map(_read_experiment, folders):
-        runs.setdefault((experiment.recipe, *experiment.seeds), []).append(experiment)
+        runs.setdefault((experiment.judged.policy.recipe, *experiment.seeds), []).append(experiment)
     experiments = list(chain.from_iterable(map(_pooled, runs.values())))
-    for key, (alike, remedy) in _SHARED.items():
-        shared = [one for one in experiments if one.judged[key] is not None]
-        for one, other in pairwise(shared):
-            if differing := differences(one.judged[key], other.judged[key]):
-                told = describe(differing, f" ({one.name}), ")
-                lines = [f"  {line} ({other.name})" for line in told]
-                raise ConfigError(
-                    f"compare.reports: expected evaluations {alike} in {reports}, but:\n"
-                    + "\n".join(lines)
-                    + f"\nEvaluate all of them with the same {remedy}, or move those that do not "
-                    "belong away."
-                )
+    for key in _SHARED:
+        _check_shared(reports, experiments, key)
     for experiment, other in pairwise(experiments):
         _check_baselines(reports, experiment, other)
     of_recipe: dict[str, list[Experiment]] = {}
     for experiment in experiments:
-        of_recipe.setdefault(experiment.recipe, []).append(experiment)
+        of_recipe.setdefault(experiment.judged.policy.recipe, []).append(experiment)
     return tuple(sorted(map(_merged, of_recipe.values()), key=_order))
 
 
@@ -162,43 +148,47 @@ def best_experiment(experiments: Sequence[Experiment], span: str) -> Experiment:
 
 
 def experiment_table(experiments: Sequence[Experiment], span: str) -> Table:
-    """An experiment a row, a baseline a row; mean absolute errors and differences with intervals.
+    """A row for each experiment and baseline, with mean absolute errors and their differences.
 
-    The baseline that sees features has the lowest error that it has in any experiment.
+    The baseline that sees features has its lowest error of all experiments.
     """
     best = best_experiment(experiments, span)
-    rows: list[list[Any]] = []
+    heading = f"{SPANS[span]} [training std]"
+    rows: list[dict[str, Any]] = []
     for experiment in experiments:
+        policy = experiment.judged.policy
         low, high = experiment.by_seed(span).min(), experiment.by_seed(span).max()
         baseline = experiment.best_baseline(span)
-        own = experiment.minus(experiment, span, baseline)
-        rows.append(
-            [
-                *(experiment.name, len(experiment.seeds), experiment.folds),
-                experiment.error(span).text(),
-                f"{low:.3f} to {high:.3f}" if len(experiment.seeds) > 1 else None,
-                "it is" if experiment is best else _verdict(experiment.minus(best, span)),
-                f"{_verdict(own)} ({HEADINGS[baseline]})",
-                *(experiment.model_type, experiment.fusion_strategy, experiment.samples),
-                experiment.parameters,
-            ]
-        )
+        apart = experiment.minus(experiment, span, baseline)
+        row = {
+            "experiment": experiment.name,
+            "seeds": len(experiment.seeds),
+            "folds": experiment.folds,
+            heading: experiment.error(span).text(),
+            "over seeds": f"{low:.3f} to {high:.3f}" if len(experiment.seeds) > 1 else None,
+            "minus the best": _verdict(experiment.minus(best, span)),
+            "minus the best baseline": f"{_verdict(apart)} ({HEADINGS[baseline]})",
+            "expert": policy.model_type,
+            "fusion": policy.fusion_strategy,
+            "samples": policy.samples,
+            "parameters": policy.parameters,
+        }
+        rows.append(row | ({"minus the best": "it is"} if experiment is best else {}))
     for method in BASELINES:
-        error = min((one.error(span, method) for one in experiments), key=lambda e: e.value)
-        rows.append([f"baseline: {HEADINGS[method]}", None, None, error.text(), *[None] * 7])
-    heads = ["experiment", "seeds", "folds", f"{SPANS[span]} [training std]", "over seeds"]
-    heads += ["minus the best", "minus the best baseline"]
-    heads += ["expert", "fusion", "samples", "parameters"]
-    return Table(heads, rows)
+        errors = (experiment.error(span, method) for experiment in experiments)
+        lowest = min(errors, key=lambda error: error.value).text()
+        named = {"experiment": f"baseline: {HEADINGS[method]}", heading: lowest}
+        rows.append(dict.fromkeys(rows[0]) | named)
+    return Table.of(rows)
 
 
 def experiment_csv(experiments: Sequence[Experiment]) -> Table:
-    """For a file."""
+    """An experiment a row, with the numbers of both spans in columns."""
     own = ("model_type", "fusion_strategy", "parameters", "samples")
     rows: list[dict[str, Any]] = []
     for experiment in experiments:
         row: dict[str, Any] = {"experiment": experiment.name}
-        row |= {key: getattr(experiment, key) for key in own}
+        row |= {key: getattr(experiment.judged.policy, key) for key in own}
         row["seeds"] = " ".join(map(str, experiment.seeds))
         row["folds"] = experiment.folds
         for span in SPANS:
@@ -225,12 +215,12 @@ def _apart(name: str, apart: Figure) -> dict[str, Any]:
 
 
 def _pooled(run: Sequence[Experiment]) -> Sequence[Experiment]:
-    """One evaluation of the folds of one training, whose test groups stand side by side.
+    """The evaluations of the folds of one training as one, with the test groups of all.
 
-    As they are where some test group is in two of them: then they are no folds.
+    Where two of them share a test group they are no folds, and stay as they are.
     """
     first, *others = run
-    groups = np.array([group for one in run for group in one.groups])
+    groups = np.array([group for fold in run for group in fold.groups])
     if not others or len(set(groups)) < len(groups):
         return run
     order = np.argsort(groups)
@@ -238,29 +228,30 @@ def _pooled(run: Sequence[Experiment]) -> Sequence[Experiment]:
     def together(parts: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
         return np.concatenate(parts, axis=-1)[..., order]
 
-    test = {name: part for one in run for name, part in one.judged["on"]["test"].items()}
+    test = {name: part for fold in run for name, part in fold.judged.on.test.items()}
+    on = first.judged.on.model_copy(update={"test": test})
     pooled = replace(
         first,
         name=_less_number(first.name),
+        judged=first.judged.model_copy(update={"on": on}),
         groups=tuple(groups[order].tolist()),
-        entries={span: together([one.entries[span] for one in run]) for span in SPANS},
-        errors={key: together([one.errors[key] for one in run]) for key in first.errors},
-        judged={**first.judged, "on": first.judged["on"] | {"test": test}},
+        entries={span: together([fold.entries[span] for fold in run]) for span in SPANS},
+        errors={key: together([fold.errors[key] for fold in run]) for key in first.errors},
         folds=len(run),
     )
     return [pooled]
 
 
-def _merged(seeds: Sequence[Experiment]) -> Experiment:
+def _merged(of_seeds: Sequence[Experiment]) -> Experiment:
     """One experiment of evaluations of one recipe, named as the first less its seed."""
-    first, *others = seeds
+    first, *others = of_seeds
     if not others:
         return first
     return replace(
         first,
         name=_less_number(first.name),
-        seeds=tuple(seed for one in seeds for seed in one.seeds),
-        errors={key: np.concatenate([one.errors[key] for one in seeds]) for key in first.errors},
+        seeds=tuple(seed for experiment in of_seeds for seed in experiment.seeds),
+        errors={key: np.concatenate([e.errors[key] for e in of_seeds]) for key in first.errors},
     )
 
 
@@ -271,23 +262,20 @@ def _less_number(name: str) -> str:
 
 def _read_experiment(folder: Path) -> Experiment:
     """The experiment of one seed and fold."""
-    text = _REPORT.read_bytes(folder / JUDGED)
-    policy = _REPORT.parse_json(text, JudgedDocument, folder / JUDGED).policy
-    document = _REPORT.parse_json(text, dict[str, JsonValue], folder / JUDGED)
+    judged = _REPORT.read_json(folder / JUDGED, JudgedDocument)
     groups, numbers = _read_groups(folder / GROUPS)
     return Experiment(
         name=folder.name,
-        seeds=(policy.seed,),
-        **policy.model_dump(exclude={"seed"}),
+        judged=judged,
+        seeds=(judged.policy.seed,),
         groups=groups,
         entries={span: numbers[f"{span}_entries"] for span in SPANS},
         errors={(way, span): numbers[f"{way}_{span}"][None] for way in METHODS for span in SPANS},
-        judged={key: document[key] for key in _SHARED},
     )
 
 
 def _read_groups(path: Path) -> tuple[tuple[str, ...], dict[str, NDArray[np.float64]]]:
-    """The names of the groups, and (group,) of each column that is compared."""
+    """The names of the groups, and the columns (group,) that are compared."""
     columns = [f"{span}_entries" for span in SPANS]
     columns += [f"{way}_{span}" for way in METHODS for span in SPANS]
     try:
@@ -304,16 +292,31 @@ def _read_groups(path: Path) -> tuple[tuple[str, ...], dict[str, NDArray[np.floa
     return groups, numbers
 
 
+def _check_shared(reports: Path, experiments: Sequence[Experiment], key: str) -> None:
+    """Raise `ConfigError` where evaluations that have this entry of `_SHARED` differ in it."""
+    alike, remedy = _SHARED[key]
+    documents = [(e.name, e.judged.model_dump(mode="json")[key]) for e in experiments]
+    for (name, entry), (other_name, other) in pairwise(pair for pair in documents if pair[1]):
+        if differing := differences(entry, other):
+            lines = [f"  {line} ({other_name})" for line in describe(differing, f" ({name}), ")]
+            raise ConfigError(
+                f"compare.reports: expected evaluations {alike} in {reports}, but:\n"
+                + "\n".join(lines)
+                + f"\nEvaluate all of them with the same {remedy}, or move those that do not "
+                "belong away."
+            )
+
+
 def _check_baselines(reports: Path, experiment: Experiment, other: Experiment) -> None:
     for (method, span), errors in experiment.errors.items():
         if method in ("policy", _OF_FEATURES):
             continue
         others = other.errors[method, span]
         if errors.shape != others.shape or not np.allclose(errors, others, rtol=_SAME, atol=1e-9):
-            found, there = experiment.by_seed(span, method)[0], other.by_seed(span, method)[0]
+            own, theirs = experiment.by_seed(span, method)[0], other.by_seed(span, method)[0]
             raise ConfigError(
                 f"compare.reports: expected the same baselines in all evaluations in {reports}, "
-                f"found {method} ({SPANS[span]}) {found:.6g} in {experiment.name} and {there:.6g} "
+                f"found {method} ({SPANS[span]}) {own:.6g} in {experiment.name} and {theirs:.6g} "
                 f"in {other.name}: they were trained on other recordings. Train and evaluate all "
                 "of them on one store, or move those that do not belong away."
             )
@@ -322,5 +325,6 @@ def _check_baselines(reports: Path, experiment: Experiment, other: Experiment) -
 def _order(experiment: Experiment) -> tuple[int, int, str]:
     """The order of params.yaml's choices."""
     experts, fusions = get_args(ModelType), get_args(FusionStrategy)
-    expert, fusion = experiment.model_type, experiment.fusion_strategy
-    return experts.index(expert), fusions.index(fusion), experiment.name
+    policy = experiment.judged.policy
+    expert, fusion = experts.index(policy.model_type), fusions.index(policy.fusion_strategy)
+    return expert, fusion, experiment.name

@@ -1,19 +1,25 @@
 """Figures with their 95 % intervals: errors, differences and ratios, by one bootstrap over groups.
 
-All draw the same groups, so that whatever is compared is compared on the same draws.
+Ticks of one recording are alike, so the unit that is drawn anew is a group of recordings (Efron and
+Tibshirani 1993, chapters 6 and 13). All figures draw the same groups: the difference of two
+figures' draws is the paired bootstrap.
 """
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.evaluate.baselines import BASELINES
-from pipeline.evaluate.intervals import FEWEST_GROUPS, bootstrap_means, interval
 from pipeline.train.scores import ActionGroup, Comparison, Errors, summed
 
 Draws = NDArray[np.float64]
+DRAWS = 2000
+FEWEST_GROUPS = 2
+"""Fewer groups give no interval: there is nothing to draw."""
 NO_INTERVAL = "intervals take at least two groups of test recordings"
 
 
@@ -27,11 +33,10 @@ class Figure:
 
     @classmethod
     def of(cls, value: float, draws: Draws | None) -> "Figure":
-        """With the interval of its draws (draw,)."""
+        """With the 2.5th and 97.5th percentiles of its draws (draw,); NaN draws are left out."""
         if draws is None or np.isnan(draws).all():
             return cls(value)
-        low, high = interval(draws)
-        return cls(value, float(low), float(high))
+        return cls(value, *np.nanpercentile(draws, [2.5, 97.5]).tolist())
 
     def text(self, sign: str = "") -> str:
         """As `0.279 (0.251–0.304)`, all in as many decimals as give the largest three digits.
@@ -73,12 +78,12 @@ class Rivalry:
 
     @property
     def ratio(self) -> float | None:
-        """The policy's error divided by the baseline's; None where that is right by itself."""
+        """The policy's error divided by the baseline's; None where the baseline's is 0."""
         return self.policy.value / self.baseline.value if self.baseline.value > 0 else None
 
     @property
     def verdict(self) -> str:
-        """`better`, `worse` or `not resolved`; without an interval, that there is none."""
+        """`better`, `worse` or `not resolved`; `no interval` without an interval."""
         if self.difference.resolved is None:
             return "no interval"
         if not self.difference.resolved:
@@ -142,3 +147,36 @@ def draws(sums: Errors, counts: NDArray[np.number]) -> Draws | None:
     if len(sums) < FEWEST_GROUPS:
         return None
     return bootstrap_means(sums[:, None], counts[:, None].astype(np.float64))[:, 0]
+
+
+def bootstrap_means(
+    sums: NDArray[np.floating], counts: NDArray[np.floating], draws: int = DRAWS, seed: int = 0
+) -> NDArray[np.float64]:
+    """Means (draw, figure) over as many groups, drawn with replacement.
+
+    `sums` (group, figure) and `counts` (group, figure), or (group, 1) for all figures, add up to
+    sum / count. NaN where a draw counts nothing. The same seed draws the same groups, whatever
+    the figures.
+    """
+    sums, counts = np.asarray(sums, np.float64), np.asarray(counts, np.float64)
+    times_drawn = _draw(len(sums), draws, seed)
+    total, count = times_drawn @ sums, times_drawn @ counts
+    count = np.broadcast_to(count, total.shape)
+    return np.divide(total, count, out=np.full(total.shape, np.nan), where=count > 0)
+
+
+@lru_cache(maxsize=4)
+def _draw(groups: int, draws: int, seed: int) -> NDArray[np.float64]:
+    """How often each group is drawn: (draw, group)."""
+    chances = np.full(groups, 1 / groups)
+    return np.random.default_rng(seed).multinomial(groups, chances, draws).astype(np.float64)
+
+
+def with_unit(name: str, unit: str) -> str:
+    """A name and, where it has one, its unit in brackets."""
+    return f"{name} [{unit}]" if unit else name
+
+
+def rounded(values: Mapping[str, float | None]) -> dict[str, float]:
+    """For a JSON document: 6 significant digits, without what has no value."""
+    return {key: float(f"{value:.6g}") for key, value in values.items() if value is not None}

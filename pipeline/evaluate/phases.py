@@ -1,6 +1,6 @@
-"""Which phase of its task each tick is of, as the force tells: approach, contact, hold.
+"""The phase of each tick, by the force: approach, contact, hold.
 
-No format that is read marks phases by itself. In contact is what `pipeline.data.contact` says.
+No format marks phases itself; `pipeline.data.contact` decides what is contact.
 """
 
 import numpy as np
@@ -32,7 +32,7 @@ def phases_of(store: FeatureStore, ticks: Ticks) -> NDArray[np.str_]:
 
 
 def _phases(store: FeatureStore, episode: Episode, columns: list[int]) -> NDArray[np.str_]:
-    """Of each tick of an episode."""
+    """(tick,) the phase of each tick of an episode."""
     first, stop = store.array("episode/sensor_start")[episode.index :][:2]
     time = store.array("sensor/time")[first:stop]
     phases = np.full(len(episode.ticks), APPROACH if len(time) else "", dtype="<U8")
@@ -51,9 +51,9 @@ def _phases(store: FeatureStore, episode: Episode, columns: list[int]) -> NDArra
 
 
 def _motion(store: FeatureStore, episode: Episode) -> NDArray[np.floating]:
-    """(tick,) how far each recorded action goes: its translation, or without any all but grippers.
+    """(tick,) the length of each recorded motion: of the translation, else of all but grippers.
 
-    Absolute actions go as far as from the action before.
+    The motion of an absolute action is the way from the action before.
     """
     action = store.streams["action"]
     groups = np.array(action_groups(action["names"], action["units"]))

@@ -1,4 +1,4 @@
-"""What several samples of a policy say beside one: their mean, the best of them, their spread."""
+"""Several samples of a policy: their mean, the best of them, their energy score."""
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -11,9 +11,10 @@ ENERGY = "energy score"
 
 
 class SampledChunks:
-    """Takes in the samples of a policy batch by batch, as `predict` shows them.
+    """Collects the samples of a policy batch by batch; the `watch` of `predict`.
 
-    `scale` (action_dim,) is that of `Comparison`: what does not vary in training counts nowhere.
+    `scale` (action_dim,) is that of `Comparison`: a dimension that does not vary in training has no
+    weight.
     """
 
     def __init__(self, scale: Float[np.ndarray, " action_dim"]) -> None:
@@ -39,16 +40,16 @@ class SampledChunks:
         self._energy.append(np.array([self._score(*pair) for pair in pairs]))
 
     def chunks(self) -> dict[str, Actions]:
-        """The mean and the best of the samples, (tick, horizon, action_dim); none of one sample.
+        """The mean and the best of the samples, (tick, horizon, action_dim); empty with one sample.
 
-        The best is that of the lowest error over the valid entries: who picks it has seen what
-        was recorded, so it tells what is among the samples, not what a robot would do.
+        The best has the lowest error over the valid entries. Only the recorded actions tell which
+        it is, so it shows what is among the samples, not what a robot would do.
         """
         ways = {MEAN: self._mean, BEST: self._best}
         return {name: np.concatenate(parts) for name, parts in ways.items() if parts}
 
     def energy(self) -> Float[np.ndarray, " tick"]:
-        """The energy score of each tick's samples; empty of one sample.
+        """The energy score of each tick's samples; empty with one sample.
 
         Gneiting and Raftery (2007), eq. 21 with beta 1, negated so that lower is better: the mean
         distance to what was recorded, less half the mean distance between two different samples.
@@ -63,7 +64,7 @@ class SampledChunks:
         recorded: Float[np.ndarray, "horizon action_dim"],
         valid: Bool[np.ndarray, " horizon"],
     ) -> float:
-        # What does not count is zero in all of them, and adds to no distance.
+        # Dimensions without weight are zero in all samples and add to no distance.
         samples = (chunks[:, valid] * self._per_std).reshape(len(chunks), -1)
         truth = (recorded[valid] * self._per_std).reshape(1, -1)
         distance = cdist(samples, truth).mean() - pdist(samples).mean() / 2

@@ -1,4 +1,4 @@
-"""Figures -> what is printed, what DVC shows, what others plot."""
+"""The figures of an evaluation as printed text, as `metrics.json` and as CSV files."""
 
 from dataclasses import astuple
 from itertools import chain
@@ -15,6 +15,7 @@ from pipeline.evaluate.ablation import AblationStudy
 from pipeline.evaluate.baselines import METHODS
 from pipeline.evaluate.evaluation import Evaluation
 from pipeline.evaluate.figures import (
+    FEWEST_GROUPS,
     NO_INTERVAL,
     Figure,
     Rivalry,
@@ -22,10 +23,10 @@ from pipeline.evaluate.figures import (
     by_group,
     error,
     rivalry,
+    rounded,
     sums_by_group,
+    with_unit,
 )
-from pipeline.evaluate.intervals import FEWEST_GROUPS
-from pipeline.evaluate.names import rounded, with_unit
 from pipeline.evaluate.phases import PHASE_RULE, PHASES
 from pipeline.evaluate.samples import BEST, ENERGY, MEAN
 from pipeline.store import FeatureStore
@@ -34,16 +35,16 @@ from pipeline.train.scores import ActionGroup, Comparison
 
 FOOTNOTE = (
     "linear fit: on the two actions before; nearest neighbour: the training tick most alike in "
-    "state and features. What an episode's first ticks lack before them is zero, or the median "
-    "where actions are absolute"
+    "state and features. Before an episode's first tick actions count as zero, or as the median "
+    "where they are absolute"
 )
 ABLATION_FOOTNOTE = "zeroed: every value at its training mean, which the policy sees as zeros"
 METRICS = "metrics.json"
 ERRORS = "errors.csv"
-"""The file with the errors of all methods over the whole chunk, a line an action group and one
+"""The file with the errors of all methods over the whole chunk: a line for each action group and
 `OVERALL`."""
 EXECUTED = "executed.csv"
-"""The same of the steps that are executed."""
+"""The same file for the steps that are executed."""
 GROUPS = "groups.csv"
 """The file with the errors of all methods by group of test recordings."""
 OVERALL = "overall"
@@ -52,16 +53,16 @@ HEADINGS = {method: method.removesuffix("_action").replace("_", " ") for method 
 
 
 def scopes(comparison: Comparison) -> dict[str, Comparison]:
-    """Errors of the steps that are executed first, then of the whole chunk.
+    """The comparison over the executed steps and over the whole chunk.
 
-    Where several are executed, the first alone stands between them.
+    Where several steps are executed, that over the first alone stands between them.
     """
     first = {"first_step": comparison.part(steps=slice(1))} if comparison.execute > 1 else {}
     return {"executed": comparison.executed, **first, "chunk": comparison}
 
 
 def titles(comparison: Comparison) -> tuple[str, str]:
-    """What is executed and the whole chunk in words, and whether their figures have intervals."""
+    """The executed steps and the whole chunk in words, with whether figures have intervals."""
     horizon = comparison.cells.entries.shape[1]
     steps = "step 0" if comparison.execute == 1 else f"the first {comparison.execute} steps"
     ends = "with 95 % intervals" if _has_intervals(comparison) else "without intervals"
@@ -76,9 +77,9 @@ def _has_intervals(comparison: Comparison) -> bool:
 
 
 def metrics(comparison: Comparison, energy: Figure | None = None) -> dict[str, Any]:
-    """The numbers that tell two evaluations apart, for `metrics.json`; the rest is in tables.
+    """The content of `metrics.json`: the main numbers of an evaluation, in 6 significant digits.
 
-    See docs/reports.md. Numbers have 6 significant digits: less would hide, more would be noise.
+    docs/reports.md describes it; all other numbers are in tables.
     """
     document: dict[str, Any] = {
         "test": {
@@ -116,7 +117,7 @@ def _plain(figure: Figure) -> dict[str, float]:
 
 
 def sample_figures(comparison: Comparison, energy: Figure | None) -> dict[str, Figure]:
-    """What several samples say beside one, over the whole chunk; none of a policy with one."""
+    """The errors of several samples beside one, over the whole chunk; empty with one sample."""
     if MEAN not in comparison.scores or energy is None:
         return {}
     names = {"one": "policy", MEAN: MEAN, BEST: BEST}
@@ -124,7 +125,7 @@ def sample_figures(comparison: Comparison, energy: Figure | None) -> dict[str, F
 
 
 def by_phase(comparison: Comparison) -> dict[str, Comparison]:
-    """The comparison on the ticks of each phase that there is."""
+    """The comparison on the ticks of each known phase."""
     return {p: comparison.of_phase(p) for p in PHASES if p in comparison.cells.phase}
 
 
@@ -140,29 +141,28 @@ def error_table(comparison: Comparison) -> Table:
 
 def difference_table(comparison: Comparison) -> Table:
     """Policy minus best baseline in each figure, and whether the difference is resolved."""
-    rows: list[list[Any]] = []
+    rows: list[dict[str, Any]] = []
     for scope, part in scopes(comparison).items():
         for group in (*part.varying_groups(), None):
             rivals = rivalry(part, group)
-            words = (scope.replace("_", " "), _heading(group), HEADINGS[rivals.best])
-            errors = (rivals.baseline.text(), rivals.difference.text("+"))
-            rows.append([*words, *errors, rivals.verdict, rivals.ratio])
-    heads = ["steps", "error", "best baseline", "its error", "policy minus it", "the policy is"]
-    return Table([*heads, "policy / best"], rows)
+            row = {"steps": scope.replace("_", " "), "error": _heading(group)}
+            row |= {"best baseline": HEADINGS[rivals.best], "its error": rivals.baseline.text()}
+            row |= {"policy minus it": rivals.difference.text("+"), "the policy is": rivals.verdict}
+            rows.append({**row, "policy / best": rivals.ratio})
+    return Table.of(rows)
 
 
 def phase_table(comparison: Comparison) -> Table:
     """Overall errors by phase, of the policy and of the baseline that is best there."""
-    rows: list[list[Any]] = []
+    rows: list[dict[str, Any]] = []
     for phase, part in by_phase(comparison).items():
-        both = rivalry(part.executed), rivalry(part)
-        cells = (
-            [r.policy.text(), f"{r.baseline.text()} {HEADINGS[r.best]}", r.verdict] for r in both
-        )
-        rows.append([phase, part.ticks, *chain(*cells)])
-    kinds = ("policy", "best baseline", "the policy is")
-    heads = (f"{scope}: {kind}" for scope in ("executed", "chunk") for kind in kinds)
-    return Table(["phase", "ticks", *heads], rows)
+        row: dict[str, Any] = {"phase": phase, "ticks": part.ticks}
+        for scope, rivals in (("executed", rivalry(part.executed)), ("chunk", rivalry(part))):
+            row[f"{scope}: policy"] = rivals.policy.text()
+            row[f"{scope}: best baseline"] = f"{rivals.baseline.text()} {HEADINGS[rivals.best]}"
+            row[f"{scope}: the policy is"] = rivals.verdict
+        rows.append(row)
+    return Table.of(rows)
 
 
 def _heading(group: ActionGroup | None) -> str:
@@ -171,7 +171,7 @@ def _heading(group: ActionGroup | None) -> str:
 
 
 def still_dimensions(comparison: Comparison) -> str:
-    """Which dimensions hardly move, and what the overall error is without; empty without any."""
+    """The dimensions that hardly move, and the overall error without them; empty without any."""
     still = comparison.low_variance()
     if not still:
         return ""
@@ -200,7 +200,7 @@ def verdicts(comparison: Comparison) -> str:
 
 
 def samples_text(comparison: Comparison, energy: Figure | None) -> str:
-    """What several samples say beside one, in a line."""
+    """A line on the errors of several samples beside one."""
     sampled = sample_figures(comparison, energy)
     if not sampled:
         return "the expert gives one chunk a tick: nothing to say of several samples"
@@ -209,7 +209,7 @@ def samples_text(comparison: Comparison, energy: Figure | None) -> str:
 
 
 def error_text(comparison: Comparison, energy: Figure | None = None) -> str:
-    """The errors of what is executed, then of the chunk; samples, verdicts, phases below them."""
+    """Tables of the executed steps and of the chunk; below them samples, verdicts and phases."""
     lines: list[str] = []
     for title, part in zip(titles(comparison), (comparison.executed, comparison), strict=True):
         lines += [f"{title}:", *error_table(part).text(), ""]
@@ -221,10 +221,10 @@ def error_text(comparison: Comparison, energy: Figure | None = None) -> str:
 
 
 def ablation_table(study: AblationStudy) -> Table:
-    """Each way to ablate a stream, between intact and best baseline.
+    """A row for each way to ablate a stream, between intact and the best baseline.
 
-    Two words, the errors of each group and the overall one, and the latter's multiple of intact
-    with its interval.
+    It has the errors of each group and overall, and the overall error in multiples of intact with
+    its interval.
     """
     best, intact = best_baseline(study.intact), study.intact.overall("policy")
     groups = study.intact.varying_groups()
@@ -246,13 +246,13 @@ def ablation_table(study: AblationStudy) -> Table:
 
 
 def ablation_text(study: AblationStudy) -> str:
-    """`ablation_table` as lines; below them what `zeroed` means, and what was not evaluated."""
+    """`ablation_table` as lines, with its footnote and the study's notes below."""
     lines = [f"{evaluated_on(study)}:", *ablation_table(study).text()]
     return "\n".join([*lines, ABLATION_FOOTNOTE, *study.notes])
 
 
 def evaluated_on(study: AblationStudy) -> str:
-    """What a table of this study says above it."""
+    """The title of the study's table."""
     return (
         f"mean absolute error on {study.intact.ticks} test ticks, {study.samples} chunk(s) a "
         "tick, one stream ablated each"
@@ -262,9 +262,8 @@ def evaluated_on(study: AblationStudy) -> str:
 def write_tables(folder: Path, evaluation: Evaluation) -> list[Path]:
     """Write metrics.json and one CSV each of all errors: see docs/reports.md.
 
-    The two by ablated stream have headings alone without a `study`: `dvc plots` would miss the
-    file, and one of an evaluation before would stay. steps.csv and streams.csv have one line a
-    point, as `dvc plots` takes them; the rest is for others.
+    Without a `study`, modalities.csv and streams.csv have headings alone: `dvc plots` needs the
+    files, and those of an earlier evaluation must not stay.
     """
     comparison, store, study = evaluation.comparison, evaluation.store, evaluation.study
     files = {
@@ -284,7 +283,7 @@ def write_tables(folder: Path, evaluation: Evaluation) -> list[Path]:
 
 
 def _errors(comparison: Comparison, group: ActionGroup | None = None) -> dict[str, Any]:
-    """The columns of all methods, of a group or overall."""
+    """The columns of all methods for a group, or overall."""
     return {
         head: value
         for method in METHODS
@@ -303,7 +302,7 @@ def _group_errors(comparison: Comparison) -> Table:
 
 
 def _recording_groups(comparison: Comparison) -> Table:
-    """The overall error by group of test recordings: what another evaluation is paired with."""
+    """The overall error by group of test recordings; `stages.compare` pairs them."""
     columns: dict[str, NDArray[Any]] = {"group": np.unique(comparison.cells.group)}
     spans = {"executed": comparison.executed, OVERALL: comparison}
     for span, part in spans.items():
@@ -366,7 +365,7 @@ def _predictions(comparison: Comparison, predictions: Predictions, store: Featur
 
 
 def _ablation_errors(study: AblationStudy | None) -> Table:
-    """Error by stream, way to ablate it, and action group."""
+    """The errors by stream, way to ablate it, and action group."""
     rows: list[list[Any]] = []
     if study is not None:
         best = best_baseline(study.intact)
@@ -380,7 +379,7 @@ def _ablation_errors(study: AblationStudy | None) -> Table:
 
 
 def _streams(study: AblationStudy | None) -> Table:
-    """The overall error by way to ablate a stream, and what of the intact."""
+    """The overall error by way to ablate a stream, and in multiples of intact."""
     rows: list[list[Any]] = []
     if study is not None:
         for way in study.ablated:

@@ -20,9 +20,8 @@ from pipeline.evaluate.baselines import METHODS
 from pipeline.evaluate.curves import TrainingCurves
 from pipeline.evaluate.episode_frames import read_episode_frames, shown_ticks
 from pipeline.evaluate.evaluation import Evaluation, trained_on_too
-from pipeline.evaluate.figures import NO_INTERVAL, best_baseline, error, rivalry
+from pipeline.evaluate.figures import NO_INTERVAL, best_baseline, error, rivalry, with_unit
 from pipeline.evaluate.figures import Figure as Merit
-from pipeline.evaluate.names import with_unit
 from pipeline.look.page.blocks import Block, Outline, Picture, Report, Section, Text
 from pipeline.look.page.style import (
     INK,

@@ -8,14 +8,10 @@ from importlib import import_module
 from typing import Any
 
 from pipeline.policy.diffusion import DiffusionActionExpert
+from pipeline.policy.encoders import ForceAwareSensorEncoder, RobotStateEncoder, SensorEncoder
 from pipeline.policy.flow_matching import FlowMatchingActionExpert
 from pipeline.policy.policy import Policy
 from pipeline.policy.regression import RegressionActionExpert
-from pipeline.policy.window_encoders import (
-    ForceAwareSensorEncoder,
-    RobotStateEncoder,
-    SensorEncoder,
-)
 
 _UNIFIED = {
     "QwenVLAUnified",

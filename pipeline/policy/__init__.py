@@ -1,4 +1,4 @@
-"""What is trained: encoders, fusion, action experts, the policy made of them, its checkpoint.
+"""The policy: encoders, fusion, action experts, and its checkpoint.
 
-This package itself stays empty, so that a checkpoint's documents are read without torch.
+This package imports nothing, so that a checkpoint's documents are read without torch.
 """

@@ -1,4 +1,4 @@
-"""Readings by their age: waves that tell a network an age, and windows at steps of equal age."""
+"""Ages of readings: their encoding for a network, and windows resampled to even ages."""
 
 import math
 
@@ -9,7 +9,7 @@ from torch import Tensor, nn
 _PERIODS = 8
 _SHORTEST_PERIOD_S, _LONGEST_PERIOD_S = 0.5, 64.0
 _LEAST_WEIGHT = 1e-3
-"""A step on which less of any reading stands has none: differences of float32 ages are rounded."""
+"""A step with less total weight has no reading: differences of float32 ages are rounded."""
 
 
 def fourier(seconds: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch wave"]:
@@ -30,7 +30,7 @@ class AgeEncoder(nn.Module):
         )
 
     def forward(self, age_s: Float[Tensor, "batch age"]) -> Float[Tensor, "batch width"]:
-        """Encode; neither output nor gradients depend on what stands for an unknown age."""
+        """Encode; an unknown age changes neither output nor gradients."""
         known = ~age_s.isnan()
         # Masked before it is encoded: zero times the gradient of a NaN is NaN.
         waves = fourier(age_s.masked_fill(~known, 0.0)) * known.unsqueeze(-1)
@@ -38,7 +38,7 @@ class AgeEncoder(nn.Module):
 
 
 def even_ages(readings: int, span_s: float, like: Tensor) -> Float[Tensor, " reading"]:
-    """The ages in s of so many readings that are spread evenly over a span, the newest 0."""
+    """The ages in s of readings that are spread evenly over a span, the newest 0."""
     steps = torch.arange(readings - 1, -1, -1, device=like.device, dtype=torch.float32)
     return steps * (span_s / readings)
 
@@ -50,7 +50,7 @@ def at_even_ages(
     steps: int,
     span_s: float,
 ) -> tuple[Float[Tensor, "batch step channel"], Bool[Tensor, "batch step"]]:
-    """The windows at `steps` evenly spread times of a span, and which stand on a valid reading.
+    """The windows at `steps` even times of a span, and which steps have a valid reading near.
 
     The last step is at the newest valid reading, whatever its age, so that readings as dense as
     steps stay as they are. The weight of a reading falls linearly with its distance in age, to 0 at

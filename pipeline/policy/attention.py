@@ -10,8 +10,10 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from pipeline.base.errors import ConfigError
-from pipeline.policy.tensors import Context, TokenMask
 
+Tokens = Float[Tensor, "batch token dim"]
+TokenMask = Bool[Tensor, "batch token"]
+"""Which tokens are real."""
 Projected = tuple[
     Float[Tensor, "batch head source head_dim"], Float[Tensor, "batch head source head_dim"]
 ]
@@ -36,13 +38,13 @@ class Attention(nn.Module):
     def forward(
         self,
         queries: Float[Tensor, "batch query dim"],
-        source: Context,
+        source: Tokens,
         valid: TokenMask | None = None,
     ) -> Float[Tensor, "batch query dim"]:
         """What each query takes from the valid tokens, of which each row must have one."""
         return self.attend(queries, self.project(source), valid)
 
-    def project(self, source: Context) -> Projected:
+    def project(self, source: Tokens) -> Projected:
         """Keys and values, for a source that is attended to more than once."""
         key, value = self.key_value(source).chunk(2, dim=-1)
         return self._split(key), self._split(value)
@@ -84,11 +86,11 @@ class TransformerLayer(nn.Module):
 
     def forward(
         self,
-        tokens: Context,
+        tokens: Tokens,
         valid: TokenMask | None = None,
         context: Float[Tensor, "batch source dim"] | Projected | None = None,
         modulation: Float[Tensor, "batch 6 dim"] | None = None,
-    ) -> Context:
+    ) -> Tokens:
         """The tokens after one layer; tokens that are not valid are never attended to.
 
         `context` may come as this layer's `project` of it, where many forward passes share it.
@@ -132,7 +134,7 @@ def learned(*shape: int) -> nn.Parameter:
     return nn.Parameter(torch.randn(*shape) * 0.02)
 
 
-def masked_mean(tokens: Context, valid: TokenMask) -> Float[Tensor, "batch dim"]:
+def masked_mean(tokens: Tokens, valid: TokenMask) -> Float[Tensor, "batch dim"]:
     """The float32 mean of each row's valid tokens, 0 where it has none."""
     weight = valid.unsqueeze(-1)
     total = tokens.float().masked_fill(~weight, 0.0).sum(dim=1)

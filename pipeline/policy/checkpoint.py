@@ -1,11 +1,9 @@
-"""A policy on disk: `policy.safetensors` and a `policy.json` that says all it takes to use it.
+"""A policy on disk: `policy.safetensors`, and all that its use takes in `policy.json`.
 
-The JSON carries the feature spec of the store it was trained from, the streams with their names
-and units, the normalisation, the params, and the episodes that it was trained on, chosen on and has
-never seen. `golden.safetensors` holds the frames and features of the store's golden rows, where it
-has any, by which a live model proves that it gives these features. No pickle.
-
-A kill at any instant leaves the previous checkpoint or the new one.
+The JSON has the feature spec of the store, the streams with their names and units, the
+normalisation, the params, and the episodes of training, val and test. `golden.safetensors` has the
+frames and features of the store's golden rows, by which a live model proves that it gives these
+features. No pickle. A kill at any instant leaves the previous checkpoint or the new one.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -35,7 +33,7 @@ from pipeline.policy.document import FORMAT, PolicyDocument
 from pipeline.policy.normalization import Normalization
 from pipeline.policy.shape import PolicyShape
 
-# torch takes over a second to import, and what only asks whether a training is finished needs none.
+# torch takes over a second to import; the check for a finished training does without it.
 if TYPE_CHECKING:
     import torch
     from torch import Tensor
@@ -58,15 +56,14 @@ class PolicyCheckpoint:
     shape: PolicyShape
     normalization: Normalization
     source: Mapping[str, Any]
-    """What the store was: `feature_spec`, `streams`, `action_hz`, `vlm_reuse_count`."""
+    """Of the store: `feature_spec`, `streams`, `action_hz`, `vlm_reuse_count`."""
     split: Mapping[Side, Mapping[str, EpisodePart]]
-    """What it was trained on (`train`), what chose it (`val`) and what it has never seen (`test`),
-    by "source/id" of the episode."""
+    """The episodes by "source/id": trained on (`train`), chosen on (`val`), never seen (`test`)."""
     step: int
     weights: Mapping[str, "Tensor"]
     metrics: Mapping[str, float] = field(default_factory=dict)
     instructions: tuple[str, ...] = ()
-    """What the store's episodes were told; empty where an earlier version wrote the checkpoint."""
+    """Of the store's episodes; empty where an earlier version wrote the checkpoint."""
     golden: tuple[GoldenRow, ...] = ()
     """Empty where the store has none, or an earlier version wrote the checkpoint."""
 
@@ -80,7 +77,7 @@ class PolicyCheckpoint:
         return policy.to(device).eval()
 
     def typical(self, stream: str) -> NDArray[np.float64]:
-        """What a stream is at its training mean: a reading (channel,), or features (slot, dim)."""
+        """A stream at its training mean: a reading (channel,), or features (slot, dim)."""
         from pipeline.policy.state_channels import typical_state
 
         statistics = getattr(self.normalization, stream)
@@ -91,8 +88,8 @@ class PolicyCheckpoint:
 
     def document(self, weights_sha256: str, golden_sha256: str | None = None) -> dict[str, Any]:
         """The content of `policy.json`; the digests are those of the files beside it."""
-        said = [{"instruction": row.instruction, "prompt": row.prompt} for row in self.golden]
-        golden = {"golden": {"sha256": golden_sha256, "rows": said}} if said else {}
+        rows = [{"instruction": row.instruction, "prompt": row.prompt} for row in self.golden]
+        golden = {"golden": {"sha256": golden_sha256, "rows": rows}} if rows else {}
         return {
             "format": FORMAT,
             "step": self.step,
@@ -151,7 +148,7 @@ def load_policy(folder: Path) -> PolicyCheckpoint:
 
     Raises `CheckpointIncomplete` naming the file that is missing, truncated or altered.
     """
-    document, said = read_document(folder / DOCUMENT, PolicyDocument)
+    document, content = read_document(folder / DOCUMENT, PolicyDocument)
     path = folder / WEIGHTS
     weights = read_tensors(path, document.weights_sha256)
     _check_tensors(path, weights, _described_weights(folder, document))
@@ -159,7 +156,7 @@ def load_policy(folder: Path) -> PolicyCheckpoint:
         params=document.params.train_head,
         shape=document.shape,
         normalization=document.normalization,
-        source={key: said[key] for key in SOURCE_KEYS},
+        source={key: content[key] for key in SOURCE_KEYS},
         split=document.split,
         step=document.step,
         metrics=document.metrics,
@@ -178,7 +175,7 @@ def check_policy(folder: Path) -> None:
 
 
 def _described_weights(folder: Path, document: PolicyDocument) -> _Layout:
-    """What the described policy learns; built without memory, for a document may ask for much.
+    """The weights of the described policy, which is built without memory: it may be huge.
 
     Raises `CheckpointIncomplete` where no such policy can be.
     """
@@ -199,8 +196,10 @@ def _layout(tensors: "Mapping[str, Tensor]") -> _Layout:
 
 
 def _check_tensors(path: Path, tensors: "Mapping[str, Tensor]", expected: _Layout) -> None:
-    """Raise `CheckpointMismatch` where a file has not the tensors that the document describes, and
-    `CheckpointIncomplete` where a number in them is none."""
+    """Raise `CheckpointMismatch` where a file's tensors are not those of the document.
+
+    Raises `CheckpointIncomplete` where a number in them is not finite.
+    """
     if differing := describe(differences(_layout(tensors), expected)):
         more = f" and {len(differing) - 1} more" if len(differing) > 1 else ""
         raise CheckpointMismatch(

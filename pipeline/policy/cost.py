@@ -1,4 +1,4 @@
-"""What a policy costs: its parameters, and the arithmetic of one act."""
+"""The cost of a policy: its parameters, and the arithmetic of one act."""
 
 from copy import deepcopy
 
@@ -13,11 +13,11 @@ from pipeline.policy.policy import Policy
 def flop_table(policy: Policy) -> list[tuple[str, int]]:
     """The floating-point operations of one `act` at one tick, by the parts of `parameter_table`.
 
-    Counted are matrix products, convolutions and attention, a multiply-add as two; norms and
-    activations are not. Windows are as long as `train_head` says. Neither the policy nor the global
-    generators are touched.
+    It counts matrix products, convolutions and attention, a multiply-add as two, but no norms and
+    activations. Windows are as long as in `train_head`. The policy and the global generators stay
+    as they are.
     """
-    # A frozen copy: the counter hooks every module, and views of what learns upset its hooks.
+    # A frozen copy: the counter's hooks fail on views of parameters that learn.
     frozen = deepcopy(policy).requires_grad_(False).eval()
     params, shape = frozen.params, frozen.shape
     sizes = {
@@ -27,7 +27,7 @@ def flop_table(policy: Policy) -> list[tuple[str, int]]:
     }
     blank = frozen.observe({name: torch.zeros(1, *size) for name, size in sizes.items()})
     generator = Generator(blank.features.device).manual_seed(0)
-    # The fused attention kernels are not counted on every device; what they replace is.
+    # Not every device counts fused attention kernels; the plain one is counted everywhere.
     with FlopCounterMode(display=False) as counter, sdpa_kernel(SDPBackend.MATH):
         frozen.act(blank, generator)
     parts = {**dict(frozen.encoders.items()), "fusion": frozen.fusion}

@@ -1,4 +1,4 @@
-"""The network that diffusion and flow matching share: a noisy chunk in, what to change out."""
+"""The network that diffusion and flow matching share: from a noisy chunk to its change."""
 
 import math
 from collections.abc import Sequence
@@ -9,10 +9,10 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from pipeline.policy.attention import Projected, TransformerLayer, learned
-from pipeline.policy.tensors import Chunk, Context, StepMask
+from pipeline.policy.expert import Chunk, Context, StepMask
 
 FREQUENCIES = 64
-"""Pairs of sine and cosine that a time is written in."""
+"""Pairs of sine and cosine that encode a time."""
 
 
 class Denoiser(nn.Module):
@@ -57,9 +57,8 @@ class Denoiser(nn.Module):
     ) -> Chunk:
         """The float32 prediction for every step of the chunk; times are in [0, 1].
 
-        `context` may be prepared, see `prepare`.
-        Steps that are not valid are never attended to: what an episode's end leaves in them says
-        nothing to the others. Predictions for them mean nothing.
+        `context` may be the result of `prepare`. Steps that are not valid, beyond an episode's end,
+        are never attended to, and predictions for them mean nothing.
         """
         if valid is not None:
             # Attention needs one token a row; a chunk without a valid step counts nothing anyway.
@@ -76,5 +75,5 @@ class Denoiser(nn.Module):
         return self.head(self.norm(tokens) * (1 + scale) + shift).float()
 
     def prepare(self, context: Context) -> Sequence[Projected]:
-        """The context as every layer attends to it, for a sampler that asks many times."""
+        """The context as every layer attends to it, for a sampler of many steps."""
         return [cast(TransformerLayer, layer).project(context) for layer in self.layers]

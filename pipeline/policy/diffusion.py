@@ -9,10 +9,20 @@ from torch import Generator
 
 from pipeline.policy.attention import Projected
 from pipeline.policy.denoiser import Denoiser
-from pipeline.policy.expert import ActionExpert, standard_normal, uniform
-from pipeline.policy.guidance import Guide, gain, pull
+from pipeline.policy.expert import (
+    ActionExpert,
+    Chunk,
+    Context,
+    Generators,
+    Guide,
+    Losses,
+    StepMask,
+    gain,
+    pull,
+    standard_normal,
+    uniform,
+)
 from pipeline.policy.noise_schedule import NoiseSchedule, Prediction, ScheduleKind
-from pipeline.policy.tensors import Chunk, Context, Generators, Losses, StepMask
 
 
 class DiffusionActionExpert(ActionExpert):

@@ -1,4 +1,4 @@
-"""What `policy.json` says, as a model: every type and bound of it, and what must fit together.
+"""The content of `policy.json` as a model: types, bounds, and what must fit together.
 
 Without torch, which takes over a second to import.
 """
@@ -22,7 +22,7 @@ Sha256 = Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
 
 
 class GoldenTexts(Document):
-    """What the model was told in a golden row."""
+    """The texts of a golden row."""
 
     instruction: Text
     prompt: Annotated[str, Field(max_length=1_000_000)]
@@ -42,10 +42,11 @@ class PolicyParams(Document):
 
     @field_validator("train_head", mode="before")
     @classmethod
-    def _without_those_of_the_run(cls, given: object) -> object:
-        """They tell nothing of the policy; earlier versions had others of them."""
-        others = ("feed", "loggers", "scratch")
-        return {k: given[k] for k in given if k not in others} if isinstance(given, dict) else given
+    def _without_run_params(cls, params: object) -> object:
+        """Leave out params of the run alone, of which earlier versions had others."""
+        if not isinstance(params, dict):
+            return params
+        return {k: params[k] for k in params if k not in ("feed", "loggers", "scratch")}
 
 
 class PolicyDocument(SourceDocument):
@@ -71,22 +72,22 @@ class PolicyDocument(SourceDocument):
             "shape.state_kinds": (len(shape.state_kinds), {0, shape.state_dim}),
             "shape.slots": (shape.slots, {len(plain)}),
             "shape.feature_dim": (shape.feature_dim, {spec.dim}),
-            # 0 of what the policy does not look at, of views where an earlier version wrote it.
+            # 0 of a stream that the policy does not see, and of views in an earlier version.
             "shape.sensor_channels": (shape.sensor_channels, {0, len(streams.sensor.names)}),
             "shape.state_dim": (shape.state_dim, {0, len(streams.state.names)}),
             "shape.views": (shape.views, {0, len(streams.views)}),
             "streams.action.names": (len(streams.action.names), {shape.action_dim}),
             "feature_spec.views": (tuple(spec.views), {tuple(streams.views)}),
         }
-        for place, (found, fitting) in expected.items():
-            if found not in fitting:
+        for place, (actual, fitting) in expected.items():
+            if actual not in fitting:
                 any_of = " or ".join(sorted(map(shown, fitting)))
-                raise ValueError(f"{place}: expected {any_of}, found {shown(found)}")
+                raise ValueError(f"{place}: expected {any_of}, found {shown(actual)}")
         for stream, size in shape.channels.items():
             fitted = getattr(self.normalization, stream)
-            found = fitted and (fitted.mean.shape, fitted.std.shape)
-            if found != (size, size) and not (fitted is None and 0 in size):
-                why = f"expected mean and std of {size}, found {found}"
+            actual = fitted and (fitted.mean.shape, fitted.std.shape)
+            if actual != (size, size) and not (fitted is None and 0 in size):
+                why = f"expected mean and std of {size}, found {actual}"
                 raise ValueError(f"normalization.{stream}: {why}")
         return self
 

@@ -1,19 +1,71 @@
-"""The contract of an action expert, and the loss over groups of action channels."""
+"""The contract of an action expert: its tensors, the guide of its samples, its grouped loss.
+
+A guide makes a sampled chunk continue another one (real-time chunking: Black, Galliker and Levine
+2025, "Real-Time Execution of Action Chunking Flow Policies", eq. 2 to 4): in every step the expert
+is pulled to where the clean chunk that it sees would agree with the guide's.
+"""
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from typing import ClassVar, Literal
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Generator, Tensor, nn
 from torch.nn import functional as F
 
 from pipeline.base.errors import ConfigError
-from pipeline.policy.guidance import Guide
-from pipeline.policy.tensors import Chunk, Context, Generators, Losses, StepMask
 
+Context = Float[Tensor, "batch token dim"]
+"""What an action expert attends to."""
+Chunk = Float[Tensor, "batch horizon action"]
+"""Action chunks: the steps of a horizon, one value a channel."""
+StepMask = Bool[Tensor, "batch horizon"]
+"""Which steps of a chunk are real."""
+Losses = tuple[Float[Tensor, ""], dict[str, Tensor]]
+"""The scalar to minimise, and its detached parts by name."""
+Generators = Generator | Sequence[Generator] | Iterator[Tensor] | None
+"""What draws a batch: one generator for all of it, one a sample, or the device's own; or the noise
+itself, in the order in which a sampler asks for it."""
 ErrorKind = Literal["smooth_l1", "mse"]
+MOST_GAIN = 5.0
+"""beta of the paper: a few sampling steps do not bear the gains that theory gives near both ends
+(appendix A.2 there)."""
+
+
+@dataclass(frozen=True)
+class Guide:
+    """The chunk to continue, and how strongly each of its steps counts, from 0 to 1.
+
+    A step of weight 0 changes nothing, whatever finite values stand in it.
+    """
+
+    chunk: Chunk
+    weight: Float[Tensor, "batch horizon"]
+
+    def repeat(self, times: int) -> "Guide":
+        """The guide of a batch repeated as a whole."""
+        return Guide(self.chunk.repeat(times, 1, 1), self.weight.repeat(times, 1))
+
+
+def pull(clean: Chunk, noisy: Chunk, guide: Guide) -> Chunk:
+    """How to change the noisy chunk so that the clean one, computed from it, nears the guide.
+
+    The vector-Jacobian product (Y - clean)^T diag(W) d clean / d noisy of eq. 2.
+    """
+    error = guide.weight.unsqueeze(-1) * (guide.chunk - clean.detach())
+    return torch.autograd.grad(clean, noisy, error)[0]
+
+
+def gain(signal: float, noise: float) -> float:
+    """The factor of `pull` in dx/dt where x = signal * clean + noise * epsilon.
+
+    (signal^2 + noise^2) / (signal * noise), at most `MOST_GAIN`: the factor of eq. 2, with
+    signal = tau and noise = 1 - tau there. A clean chunk is changed by `noise` times as much.
+    """
+    product = signal * noise
+    return min(MOST_GAIN, (signal**2 + noise**2) / product) if product else MOST_GAIN
 
 
 class ActionExpert(nn.Module, ABC):

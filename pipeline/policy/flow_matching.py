@@ -8,9 +8,19 @@ from jaxtyping import Float
 from torch import Generator, Tensor, nn
 
 from pipeline.policy.denoiser import Denoiser
-from pipeline.policy.expert import ActionExpert, standard_normal, uniform
-from pipeline.policy.guidance import Guide, gain, pull
-from pipeline.policy.tensors import Chunk, Context, Generators, Losses, StepMask
+from pipeline.policy.expert import (
+    ActionExpert,
+    Chunk,
+    Context,
+    Generators,
+    Guide,
+    Losses,
+    StepMask,
+    gain,
+    pull,
+    standard_normal,
+    uniform,
+)
 
 Solver = Literal["euler", "midpoint", "rk4"]
 Velocity = Callable[[Tensor, float], Tensor]

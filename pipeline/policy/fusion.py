@@ -8,26 +8,26 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from pipeline.policy.attention import TransformerLayer, learned
-from pipeline.policy.tensors import Context
+from pipeline.policy.expert import Context
 
 Tokens = Mapping[str, Float[Tensor, "batch _ _"]]
 Shapes = Mapping[str, tuple[int, int]]
 """Tokens and width of each encoder, by its name."""
 
 _TOKENS = 4
-"""Of a context that is read out of one vector, or asked for by learned queries."""
+"""Tokens of a context that is read out of one vector, or asked for by learned queries."""
 _LAYERS = 2
-"""Of `CrossAttentionFusion`."""
+"""Layers of `CrossAttentionFusion`."""
 _MARK_STD = 3**-0.5
-"""That of a normalised token after a linear layer as torch initialises it."""
+"""The std of a normalised token after a linear layer as torch initialises it."""
 
 
 class Fusion(nn.Module, ABC):
     """The contract: tokens (batch, token, width) an encoder in, context (batch, token, dim) out.
 
-    Encoders are named `features`, `sensor`, `state`, any of them; all that `shapes` named are
-    always there. What is missing or masked is settled before: it comes as learned embeddings. No
-    stream drowns another by its scale. The number of context tokens is fixed by the constructor.
+    Encoders are named `features`, `sensor` and `state`; every encoder in `shapes` always gives its
+    tokens, learned embeddings for what is missing or masked. No stream drowns another by its scale.
+    The constructor fixes the number of context tokens.
     """
 
     @abstractmethod

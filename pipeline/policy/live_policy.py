@@ -1,4 +1,4 @@
-"""A policy whose features, of some samples or all, a model computes as it goes."""
+"""A policy with a model in front, which computes the features of some or all samples."""
 
 from collections.abc import Callable, Generator, Iterator, Mapping
 from contextlib import contextmanager
@@ -9,10 +9,9 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from pipeline.base.observation import Observation
-from pipeline.policy.guidance import Guide
+from pipeline.policy.expert import Chunk, Generators, Guide, Losses, StepMask
 from pipeline.policy.observation import LiveObservation, with_features
 from pipeline.policy.policy import Policy, Trainable
-from pipeline.policy.tensors import Chunk, Generators, Losses, StepMask
 
 Model = TypeVar("Model", bound=nn.Module)
 
@@ -20,7 +19,7 @@ Model = TypeVar("Model", bound=nn.Module)
 class LivePolicy(Trainable, Generic[Model]):
     """A policy and, in front of it, a model `rows -> (features, valid)`.
 
-    A `LiveObservation` is looked at through the model, any other goes to the policy as it is.
+    The model computes the features of a `LiveObservation`; any other goes to the policy as it is.
     """
 
     policy: Policy
@@ -28,9 +27,9 @@ class LivePolicy(Trainable, Generic[Model]):
     """The model, or None while it is not loaded."""
 
     def __init__(self, policy: Policy, load: Callable[[str], Model], tuned: bool) -> None:
-        """`load(device)` gives the model, should one be needed before `vlm` is set.
+        """`load(device)` loads the model where it is needed before `vlm` is set.
 
-        Of a `tuned` model something learns, so it is loaded before its weights are asked for.
+        A `tuned` model has parameters that learn, so it is loaded before its weights are read.
         """
         super().__init__()
         self.policy = policy
@@ -119,7 +118,7 @@ class LivePolicy(Trainable, Generic[Model]):
             yield
         finally:
             for part in self.modules():
-                # A model that was loaded meanwhile goes the way of the whole.
+                # A model that was loaded meanwhile takes the mode of the whole.
                 part.training = modes.get(part, modes[self])
 
     def _seen(self, observation: Observation) -> Observation:

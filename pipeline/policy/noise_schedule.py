@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from pipeline.policy.tensors import Chunk
+from pipeline.policy.expert import Chunk
 
 ScheduleKind = Literal["cosine", "linear"]
 Prediction = Literal["epsilon", "sample", "v"]

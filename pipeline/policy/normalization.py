@@ -29,6 +29,7 @@ _PIECE_VALUES = 4_194_304
 _LEAST_SPREAD = 0.05
 """Of what is usual for inputs alike: what rested in training is noise, and may move later."""
 
+_TINY = float(np.finfo(np.float32).tiny)
 _RELATIVE_FLOOR = 4 * float(np.finfo(np.float32).eps)
 """A spread below a few float32 steps of the mean is rounding, not signal."""
 
@@ -67,8 +68,16 @@ class ChannelStatistics:
 
         So a constant channel comes out as 0 and inverts exactly.
         """
-        floor = np.maximum(_RELATIVE_FLOOR * np.abs(self.mean), float(np.finfo(np.float32).tiny))
-        return np.where(self.std > floor, self.std, 1.0)
+        return np.where(self._varies, self.std, 1.0)
+
+    @property
+    def spread(self) -> NDArray[np.float64]:
+        """`std`, or 0 where the channel does not vary."""
+        return np.where(self._varies, self.std, 0.0)
+
+    @property
+    def _varies(self) -> NDArray[np.bool_]:
+        return self.std > np.maximum(_RELATIVE_FLOOR * np.abs(self.mean), _TINY)
 
     def floored(self, usual: NDArray[np.float64]) -> "ChannelStatistics":
         """The same, of which no spread is far below what is `usual` for channels alike.

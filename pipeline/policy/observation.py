@@ -1,4 +1,4 @@
-"""What a policy is built for, and observations made by hand that are checked against it."""
+"""Observations of a policy, and the check of those made by hand against its shape."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -16,8 +16,8 @@ from pipeline.policy.ages import even_ages
 from pipeline.policy.shape import Axes, PolicyShape
 
 VALIDITY = {"features": "slot_valid", "sensor": "sensor_valid", "state": "state_valid"}
-"""What a policy may have encoders of, in the order in which it builds them, and the field that says
-what of it is real: (batch, slot) bool of the features, else (batch,) counts."""
+"""The streams that a policy may encode, in the order of its encoders, and the field of what is real
+in a stream: (batch, slot) bool of the features, else (batch,) counts."""
 
 AGES = {"sensor": "sensor_age", "state": "state_age"}
 """The field with the ages of a stream's readings."""
@@ -25,18 +25,18 @@ AGES = {"sensor": "sensor_age", "state": "state_age"}
 
 @dataclass
 class LiveObservation(Observation):
-    """An observation whose features, of some samples or all, a model has yet to compute."""
+    """An observation for which a model has yet to compute the features of some or all samples."""
 
     rows: Sequence[Any]
-    """What the model takes (`pipeline.vlm.preparation.PreparedRow`), each distinct one once."""
+    """The distinct inputs of the model (`pipeline.vlm.preparation.PreparedRow`)."""
     row_of: Int[Tensor, " batch"]
     """Index into `rows` of each sample; -1 keeps the sample's cached features."""
 
 
 def moving_channels(action: Mapping[str, Any]) -> tuple[bool, ...]:
-    """Which channels of a store's `streams["action"]` say how far to move, not where to be.
+    """Which channels of a store's `streams["action"]` are motions: deltas and velocities.
 
-    Deltas and velocities, save a gripper's, which is a position in every format.
+    Not a gripper's, which is a position in every format.
     """
     moves = action["kind"] != "absolute"
     groups = action_groups(action["names"], action["units"])
@@ -44,7 +44,7 @@ def moving_channels(action: Mapping[str, Any]) -> tuple[bool, ...]:
 
 
 def stream_of(field: str) -> str:
-    """The stream that a field of an observation is about."""
+    """The stream of a field of an observation."""
     if field in ("slot_valid", "feature_age", "view_age"):
         return "features"
     return field.removesuffix("_valid").removesuffix("_age")
@@ -58,20 +58,20 @@ def build_observation(
     rows: Sequence[Any] = (),
     row_of: Sequence[int] = (),
 ) -> LiveObservation:
-    """The observation of the fields that are given; what is not given is missing.
+    """The observation with the `given` fields; other streams are missing.
 
-    Without its `*_valid` a stream is all real, without `*_age` its readings are spread evenly over
-    the seconds of its window; without `feature_age` features are new, and without `view_age` all
-    views as old as they are. Raises `ObservationError` for a `*_valid` or an age without its
+    Without its `*_valid` a stream is all real, without `*_age` its readings spread evenly over the
+    seconds of its window. Without `feature_age` features are new, without `view_age` all views are
+    as old as the features. Raises `ObservationError` for a `*_valid` or an age without its
     stream, and for a shape that is not the policy's or not the batch's.
     """
     for name in given:
-        told = name.endswith("_valid") or name in AGES.values()
-        if told and stream_of(name) not in given:
+        describes = name.endswith("_valid") or name in AGES.values()
+        if describes and stream_of(name) not in given:
             raise ObservationError(f"{name}: expected {stream_of(name)} beside it, which it is of")
     first = next((name for name in VALIDITY if name in given), "images")
     index = torch.tensor(row_of, dtype=torch.int64, device=device)
-    # The number of elements and not len, which a scalar lacks; its shape is refused all the same.
+    # A scalar has no len; `check_axes` refuses its shape below.
     count = given[first].shape[:1].numel() if first in given else len(index)
     axes = shape.stream_axes()
     lengths = {"sensor": params.sensor_window, "state": params.state_window}
@@ -111,7 +111,7 @@ def with_features(
     features: Float[Tensor, "row slot dim"],
     slot_valid: Bool[Tensor, "row slot"],
 ) -> Observation:
-    """The observation with the features of its rows where a sample has one."""
+    """The observation with the features of its rows, where a sample has a row."""
     given = {name: getattr(observation, name) for name in Observation.__dataclass_fields__}
     row_of = observation.row_of.to(features.device)
     live, index = row_of >= 0, row_of.clamp(min=0)
@@ -122,9 +122,9 @@ def with_features(
 
 
 def check_axes(name: str, value: Tensor, axes: Axes, batch_of: str) -> None:
-    """Raise `ObservationError` where an argument has not these axes.
+    """Raise `ObservationError` where an argument lacks these axes.
 
-    `batch_of` is the argument that says how large the batch is.
+    `batch_of` is the argument that determines the size of the batch.
     """
     actual = tuple(value.shape)
     fits = len(actual) == len(axes) and all(

@@ -12,11 +12,24 @@ from pipeline.base.config import TrainHeadParams
 from pipeline.base.errors import ConfigError, ObservationError
 from pipeline.base.observation import Observation
 from pipeline.policy.diffusion import DiffusionActionExpert
-from pipeline.policy.expert import ActionExpert, uniform
-from pipeline.policy.feature_encoder import FeatureEncoder
+from pipeline.policy.encoders import (
+    FeatureEncoder,
+    ForceAwareSensorEncoder,
+    RobotStateEncoder,
+    SensorEncoder,
+)
+from pipeline.policy.expert import (
+    ActionExpert,
+    Chunk,
+    Context,
+    Generators,
+    Guide,
+    Losses,
+    StepMask,
+    uniform,
+)
 from pipeline.policy.flow_matching import FlowMatchingActionExpert
 from pipeline.policy.fusion import build_fusion
-from pipeline.policy.guidance import Guide
 from pipeline.policy.normalization import ChannelStatistics, Normalization
 from pipeline.policy.observation import (
     AGES,
@@ -28,12 +41,6 @@ from pipeline.policy.observation import (
 )
 from pipeline.policy.regression import RegressionActionExpert
 from pipeline.policy.state_channels import expand
-from pipeline.policy.tensors import Chunk, Context, Generators, Losses, StepMask
-from pipeline.policy.window_encoders import (
-    ForceAwareSensorEncoder,
-    RobotStateEncoder,
-    SensorEncoder,
-)
 
 EXPERTS: dict[str, type[ActionExpert]] = {
     "regression": RegressionActionExpert,
@@ -50,12 +57,12 @@ SENSOR_ENCODERS: dict[str, type[SensorEncoder] | type[ForceAwareSensorEncoder]] 
 
 
 _LARGEST = 10.0
-"""Beyond so many deviations from the training mean an input says no more: what rested in training
-and moves later must not drown all else."""
+"""Inputs are held within so many deviations of the training mean: a channel that rested in training
+and moves later must not drown the others."""
 
 
 class Trainable(nn.Module, ABC):
-    """What every module that is trained or judged can do."""
+    """The interface of every module that is trained or evaluated."""
 
     @abstractmethod
     def loss(
@@ -75,8 +82,11 @@ class Trainable(nn.Module, ABC):
         generator: Generators = None,
         guide: Guide | None = None,
     ) -> Float[Tensor, "sample batch horizon action"]:
-        """Action chunks in physical units, float32; with a guide, in physical units too, chunks
-        that continue its chunk: only a `stochastic` policy is given a guide."""
+        """Action chunks in physical units, float32.
+
+        With a guide, also in physical units, they continue its chunk; only a `stochastic` policy
+        takes one.
+        """
 
     def act(
         self, observation: Observation, generator: Generators = None, guide: Guide | None = None
@@ -87,7 +97,7 @@ class Trainable(nn.Module, ABC):
     @property
     @abstractmethod
     def stochastic(self) -> bool:
-        """Whether two samples differ; else any number of them costs one."""
+        """Whether two samples differ; if not, any number of them costs one."""
 
     @abstractmethod
     def parameter_table(self) -> list[tuple[str, int]]:
@@ -126,7 +136,7 @@ class Policy(Trainable):
     """
 
     feature_spec: Mapping[str, Any] | None = None
-    """What the features are that it was trained on, where a checkpoint says so."""
+    """Of the features it was trained on; None without a checkpoint."""
 
     def __init__(
         self, params: TrainHeadParams, shape: PolicyShape, normalization: Normalization
@@ -145,13 +155,13 @@ class Policy(Trainable):
 
     @property
     def stochastic(self) -> bool:
-        """Whether the expert draws what it answers."""
+        """Whether the expert draws its chunks."""
         return self.expert.stochastic
 
     def context(
         self, observation: Observation, validity: Mapping[str, Tensor] | None = None
     ) -> Context:
-        """What the expert attends to; by default of all that is valid."""
+        """What the expert attends to; by default every valid part of the observation."""
         return self.fusion(
             {
                 name: self.encode(name, observation, valid)
@@ -178,7 +188,7 @@ class Policy(Trainable):
         context = self.context(observation, validity)
         return self.expert.loss(context, target, action_valid, generator)
 
-    @torch.inference_mode(False)  # in which guidance could not differentiate
+    @torch.inference_mode(False)  # guidance differentiates, which inference mode forbids
     @torch.no_grad()
     def sample(
         self,
@@ -204,11 +214,11 @@ class Policy(Trainable):
     def observe(
         self, streams: Mapping[str, Any], rows: Sequence[Any] = (), row_of: Sequence[int] = ()
     ) -> LiveObservation:
-        """The observation of what was given, on the policy's device; what was not is missing.
+        """The observation of these streams on the policy's device; other streams are missing.
 
-        `streams` has the fields of `Observation` as tensors or arrays, None where not given. A
-        stream without an encoder is left out. Raises `ObservationError` where nothing is left to
-        look at, and as `build_observation`.
+        `streams` has fields of `Observation` as tensors or arrays, or None. A stream without an
+        encoder is left out. Raises `ObservationError` where no stream is left, and as
+        `build_observation`.
         """
         device = next(self.parameters()).device
         given = {
@@ -223,14 +233,14 @@ class Policy(Trainable):
         return build_observation(self.shape, self.params, given, device, rows, row_of)
 
     def parameter_table(self) -> list[tuple[str, int]]:
-        """The number of parameters of encoders by stream, `fusion`, `expert`: as they work."""
+        """The number of parameters of each encoder, of `fusion` and of `expert`, in this order."""
         parts = {**dict(self.encoders.items()), "fusion": self.fusion, "expert": self.expert}
         return [(name, sum(p.numel() for p in part.parameters())) for name, part in parts.items()]
 
     def encode(
         self, stream: str, observation: Observation, valid: Tensor
     ) -> Float[Tensor, "batch token width"]:
-        """The tokens of a stream, of which only what `valid` counts or marks is looked at."""
+        """The tokens of a stream, from the part of it that `valid` counts or marks."""
         normalizer, encoder = self.normalizers[stream], self.encoders[stream]
         assert isinstance(normalizer, Normalizer)
         values = getattr(observation, stream)
@@ -301,9 +311,9 @@ def drop_streams(
 ) -> dict[str, Tensor]:
     """The validity of each stream, 0 for a random share `rates[stream]` of the samples.
 
-    Modality dropout (Neverova et al. 2016, "ModDrop"): so that a policy learns to lean on what
-    it has. Streams are dropped independently, but a sample never loses all that it has: one of
-    its streams, each as likely, is then kept. With rates p and q of two streams, the first is
+    Modality dropout (Neverova et al. 2016, "ModDrop") teaches a policy to use the streams it has.
+    Streams are dropped independently, but a sample never loses all of its streams: one of them,
+    each as likely, is then kept. With rates p and q of two streams, the first is
     thus missing from p - pq/2 of the samples that have both.
     """
     device = next(iter(validity.values())).device

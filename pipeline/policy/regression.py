@@ -6,9 +6,7 @@ import torch
 from torch import Generator, Tensor, nn
 
 from pipeline.policy.attention import TransformerLayer, learned
-from pipeline.policy.expert import ActionExpert
-from pipeline.policy.guidance import Guide
-from pipeline.policy.tensors import Chunk, Context, Generators, Losses, StepMask
+from pipeline.policy.expert import ActionExpert, Chunk, Context, Generators, Guide, Losses, StepMask
 
 
 class RegressionActionExpert(ActionExpert):

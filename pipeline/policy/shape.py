@@ -1,4 +1,4 @@
-"""What a policy is built for: the widths of its streams and the kinds of its channels. No torch."""
+"""The shape of a policy: the widths of its streams and the kinds of its channels. No torch."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ Axes = Mapping[str, int | None]
 """Names and sizes of a tensor's axes; None is any size above 0."""
 
 Kind = Literal["plain", "deg", "rad", "rotation"]
-"""Of a channel: as it is; an angle; one of three, in degrees, that turn a pose."""
+"""Of a channel: plain; an angle; one of the three angles, in degrees, of a pose's rotation."""
 
 _POSE_ANGLES = ("pose_a", "pose_b", "pose_r")
 _ANGLES: dict[str, Kind] = {"deg": "deg", "rad": "rad"}
@@ -22,7 +22,7 @@ _SIX = tuple(f"rotation_{index}" for index in range(6))
 
 
 def channel_kinds(names: Sequence[str], units: Sequence[str]) -> tuple[Kind, ...]:
-    """The kind of each channel; the arm's pose angles are a rotation where all three are there."""
+    """The kind of each channel; the three pose angles of the arm together are a rotation."""
     turned = {*_POSE_ANGLES} <= {*names}
     kinds: list[Kind] = []
     for name, unit in zip(names, units, strict=True):
@@ -32,7 +32,7 @@ def channel_kinds(names: Sequence[str], units: Sequence[str]) -> tuple[Kind, ...
 
 
 def expanded_names(names: Sequence[str], kinds: Sequence[Kind]) -> list[str]:
-    """The channels of `expand`, in its order."""
+    """The names of the channels that `expand` returns."""
     plain = [name for name, kind in zip(names, kinds, strict=True) if kind == "plain"]
     angles = [name for name, kind in zip(names, kinds, strict=True) if kind in ("deg", "rad")]
     waves = [f"{name}_{wave}" for wave in ("sin", "cos") for name in angles]
@@ -56,7 +56,7 @@ class PolicyShape:
     action_groups: tuple[Group, ...]
     """Of each action channel."""
     views: Size = 0
-    """Whose ages a policy is told."""
+    """Views whose ages are inputs."""
     state_kinds: tuple[Kind, ...] = ()
     """Of each state channel; empty where all are plain."""
 

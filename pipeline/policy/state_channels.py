@@ -1,4 +1,4 @@
-"""Robot states as networks take them: no value jumps where an angle is written a turn further."""
+"""Robot states as networks take them: angles and rotations without a jump at a full turn."""
 
 import math
 from collections.abc import Sequence
@@ -13,11 +13,11 @@ from pipeline.policy.shape import Kind
 def expand(
     values: Float[Tensor, "batch reading channel"], kinds: Sequence[Kind]
 ) -> Float[Tensor, "batch reading expanded"]:
-    """Windows of states (float32) whose angles are sines and cosines, and their rotations 6-D.
+    """Windows of states (float32) with angles as sines and cosines, and rotations in six numbers.
 
     A pose's rotation R = Rx(a)·Ry(b)·Rz(r) is taken relative to that of the window's last reading,
     and written as the first two columns of the matrix (Zhou et al. 2019, "On the Continuity of
-    Rotation Representations", section 4.2). So an angle written a turn further changes nothing.
+    Rotation Representations", section 4.2). So a full turn more changes nothing.
     """
     if not {*kinds} - {"plain"}:
         return values
@@ -34,9 +34,9 @@ def expand(
 
 
 def typical_state(mean: Sequence[float], kinds: Sequence[Kind]) -> list[float]:
-    """A state (channel,) whose `expand` is the mean (expanded,), as near as there is such a state.
+    """A state (channel,) whose `expand` is nearest to the mean (expanded,).
 
-    Of a rotation any is: relative to itself it is none.
+    Rotations are 0: relative to itself a reading has none.
     """
     if not {*kinds} - {"plain"}:
         return list(mean)

@@ -31,9 +31,9 @@ from pipeline.base.errors import ConfigError, NumericsError
 from pipeline.base.observation import Observation
 from pipeline.base.ownership import OutputKind
 from pipeline.policy.checkpoint import PolicyCheckpoint
+from pipeline.policy.expert import Chunk
 from pipeline.policy.observation import AGES
 from pipeline.policy.policy import Policy
-from pipeline.policy.tensors import Chunk
 from pipeline.robot.export_inputs import Inputs, chunk_size, golden_inputs
 
 RECEIPT, CONTRACT = "receipt.json", "contract.json"

@@ -16,7 +16,7 @@ from pipeline.base.config import VLMParams
 from pipeline.base.device import resolve_device
 from pipeline.base.errors import CheckpointMismatch, NumericsError, ObservationError
 from pipeline.policy.checkpoint import PolicyCheckpoint, find_policy, load_policy
-from pipeline.policy.guidance import Guide
+from pipeline.policy.expert import Guide
 from pipeline.policy.observation import moving_channels
 from pipeline.policy.policy import Policy
 from pipeline.robot.chunking import PlanGuide

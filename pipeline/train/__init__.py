@@ -1,5 +1,5 @@
-"""Training a policy: one loop for every expert, from a store or with a live model in front.
+"""Training a policy: one loop for every expert, from a store or with a model in front that learns.
 
-Resumable at every checkpoint; on one process, or on several that torchrun started. This package
-itself stays empty: most modules bring torch, and to see that a run is finished takes none.
+A run goes on from every checkpoint, on one process or on several of torchrun. This package imports
+nothing: most modules import torch, which the check for a finished run does without.
 """

@@ -1,8 +1,8 @@
-"""Batches of a store on their way to a policy: what each is made of, and who gathers it where.
+"""Batches of a store on their way to a policy: what a batch is made of, and where it is gathered.
 
 `Prefetch` gathers ahead of time into a few reused buffers: a fresh output for every batch costs
 more in page faults than the gather itself, and a gather between two steps makes the device wait.
-`DeviceStore` holds streams on the device and gathers there; `choose_feed` picks what it holds.
+`DeviceStore` holds streams on the device and gathers there; `choose_feed` chooses which.
 """
 
 import time
@@ -29,14 +29,14 @@ from pipeline.store.mapping import fitting
 
 Ticks = NDArray[np.int64]
 _DEVICE_SHARE = 0.6
-"""Of the device's free memory, what a store may fill: the rest is for the model and its step."""
+"""The share of the device's free memory that a store may fill; the rest is for the training."""
 
 
 @dataclass(frozen=True)
 class Lags:
     """How late each stream is: `features` in whole VL rows, the others in seconds.
 
-    Of all samples of a batch, or (batch,).
+    One number for all samples of a batch, or (batch,).
     """
 
     features: Late = 0
@@ -49,12 +49,12 @@ NO_LAGS = Lags()
 
 @dataclass(frozen=True, eq=False)
 class BatchIndices:
-    """What one batch is made of."""
+    """The ticks of a batch, and which variant and lag each sees."""
 
     ticks: Ticks
     """(batch,) store-global."""
     variants: NDArray[np.int64] | None = None
-    """(batch,) which stored variant of its VL row each tick sees; None: all 0, the plain frames."""
+    """(batch,) the stored variant of the VL row of each tick; None: all 0, the plain frames."""
     lags: Lags = NO_LAGS
 
 
@@ -66,15 +66,15 @@ def cut_batches(ticks: Ticks, batch_size: int) -> list[BatchIndices]:
 
 
 def evenly(ticks: Ticks, most: int) -> Ticks:
-    """All of these ticks, or as many as are allowed, evenly spaced."""
+    """These ticks, or `most` of them, evenly spaced."""
     return ticks[np.linspace(0, len(ticks) - 1, min(len(ticks), most)).round().astype(np.int64)]
 
 
 @dataclass(frozen=True)
 class Windows:
-    """How much of each stream a sample sees: ticks, most readings, and seconds before the tick.
+    """How much of each stream a sample sees: ticks, readings at most, and seconds before the tick.
 
-    None is any age. The names are those of `FeatureStore.gather`.
+    Seconds of None allow any age. The names are those of `FeatureStore.gather`.
     """
 
     horizon: int
@@ -85,7 +85,7 @@ class Windows:
 
     @classmethod
     def of(cls, params: TrainHeadParams) -> Self:
-        """What this policy needs; of a stream whose encoder is off, a single reading."""
+        """The windows of this policy; a single reading of a stream whose encoder is off."""
         return cls(
             params.horizon,
             params.sensor_window if params.sensor_enabled else 1,
@@ -98,23 +98,23 @@ class Windows:
 class DeviceStore:
     """The arrays of these wide fields of a store (`pipeline.store.gather.WIDE`) on a device.
 
-    Copied once, with a progress bar. Which rows a batch is made of is worked out on the host: a few
-    small index tensors are all that is sent for a batch.
+    They are copied once, with a progress bar. The host works out the rows of a batch and sends only
+    a few small index tensors.
     """
 
     def __init__(self, store: FeatureStore, fields: Collection[str], device: torch.device) -> None:
         sources = {name: store.gatherer.tensor(name) for name in sorted(fields)}
         sources = {name: source for name, source in sources.items() if source.nbytes}
         self.fields = frozenset(sources)
-        """What lives there; of a stream that the store lacks there is nothing to hold."""
+        """The fields that live there; a stream that the store lacks has none."""
         self._device = device
         bar = tqdm(sources.items(), f"store to {device}", unit="stream", disable=None)
         self._tensors = {name: source.to(device, copy=True) for name, source in bar}
 
     def complete(self, batch: Batch, selection: Selection) -> Batch:
-        """The batch with what lives here, on the device; the rest of it stays where it is.
+        """The batch with this store's fields, on the device; the other fields stay where they are.
 
-        On CUDA nothing is waited for: the work joins the current stream.
+        On CUDA it does not wait: the work joins the current stream.
         """
         gathered: dict[str, Tensor] = {}
         for name in self.fields & selection.rows.keys():
@@ -148,10 +148,10 @@ class DeviceStore:
 def choose_feed(
     feed: str, store: FeatureStore, device: torch.device, free: int | None = None
 ) -> tuple[frozenset[str], str]:
-    """Which wide fields of a batch live on the device, and a line on why.
+    """Which wide fields of a batch live on the device, and a line that says why.
 
-    `device` takes the streams that fit into `free` bytes there (measured if None), the smallest
-    first; `auto` takes a GPU if all fit.
+    With `feed` "device" the streams that fit into `free` bytes there (measured if None), the
+    smallest first; with "auto" all of them on a GPU where all fit, else none.
     """
     by = "auto" if feed == "auto" else "as train_head.feed says"
     if feed == "mapped":
@@ -178,7 +178,7 @@ _Filled = tuple[BatchIndices, Batch, Selection]
 
 @dataclass
 class _Buffer:
-    """A reused host batch, and the copy out of it that has to end before it is filled again."""
+    """A reused host batch, and the copy out of it that must end before the next is filled in."""
 
     batch: Batch | None = None
     copied: torch.cuda.Event | None = None
@@ -193,9 +193,9 @@ class Prefetch(Iterator[tuple[BatchIndices, Batch]], AbstractContextManager["Pre
     out of `next` at the batch it belongs to. Use as a context manager, or call `close`. The thread
     does not survive a fork: a forked process reads from the same store with a `Prefetch` it makes.
 
-    What `resident` holds of the store is gathered on its device, into fresh memory; on CUDA when
-    the batch is handed out, in the order of the consumer's stream. The rest of the store is read
-    into memory in the background, as far as it fits.
+    Fields that `resident` holds are gathered on its device, into fresh memory; on CUDA when the
+    batch is handed out, in the order of the consumer's stream. The rest of the store is read into
+    memory in the background, as far as it fits.
     """
 
     def __init__(
@@ -260,7 +260,7 @@ class Prefetch(Iterator[tuple[BatchIndices, Batch]], AbstractContextManager["Pre
         self._coming.append((buffer, self._thread.submit(self._fill, buffer)))
 
     def _fill(self, buffer: _Buffer) -> _Filled | None:
-        """The next batch of the plan; None at its end. For a GPU it lacks what lives there."""
+        """The next batch of the plan, without what lives on a GPU; None at the plan's end."""
         indices = next(self._plan, None)
         if indices is None:
             return None

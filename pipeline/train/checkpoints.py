@@ -1,4 +1,4 @@
-"""What going on with a run takes beyond its policy, as safetensors and JSON, and the way back."""
+"""The trainer's state beside a policy, as safetensors and JSON: what it takes to resume a run."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -16,14 +16,14 @@ from pipeline.policy.checkpoint import load_policy
 from pipeline.policy.document import Sha256
 from pipeline.policy.normalization import Normalization
 from pipeline.policy.observation import PolicyShape
+from pipeline.train.process_group import ProcessGroup
 from pipeline.train.run import TRAINER_DOCUMENT, TRAINER_WEIGHTS, TrainingRun
-from pipeline.train.world import World
 
 
 class TrainerState(Document):
-    """A run after `step` steps, as `trainer.json` has it.
+    """A run after `step` steps, as in `trainer.json`.
 
-    There is no random state and no schedule state in it: both follow from the seed and the step.
+    It has no random state and no schedule state: both follow from the seed and the step.
     """
 
     step: Annotated[int, Field(ge=0)]
@@ -41,16 +41,16 @@ class TrainerState(Document):
 def write_trainer(folder: Path, state: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> None:
     """Write the two files of a trainer's state into an existing folder.
 
-    `state` has the fields of `TrainerState` but for the digest. `tensors` are what learns
-    (`weights:<name in the trained module>`), the moving `average:` of each, the `optimizer:` state
-    and the `history:`, a row for every step so far.
+    `state` has the fields of `TrainerState` but for the digest. `tensors` are the learning
+    parameters (`weights:<name in the trained module>`), the moving `average:` of each, the
+    `optimizer:` state and the `history:`, a row for every step so far.
     """
     digest = write_tensors(folder / TRAINER_WEIGHTS, tensors)
     write_with_digest(folder / TRAINER_DOCUMENT, {**state, "weights_sha256": digest})
 
 
 def read_trainer(folder: Path) -> tuple[TrainerState, dict[str, Tensor]]:
-    """The state at `folder`; `CheckpointIncomplete` where a file is missing or damaged."""
+    """The state at `folder`. Raises `CheckpointIncomplete` where a file is missing or damaged."""
     state, _ = read_document(folder / TRAINER_DOCUMENT, TrainerState)
     return state, read_tensors(folder / TRAINER_WEIGHTS, state.weights_sha256)
 
@@ -65,9 +65,9 @@ def of_kind(tensors: Mapping[str, Tensor], kind: str) -> dict[str, Tensor]:
 def load_weights(
     parameters: Mapping[str, nn.Parameter], tensors: Mapping[str, Tensor], place: Path
 ) -> None:
-    """Lay the tensors into the parameters of the same names.
+    """Copy the tensors into the parameters of the same names.
 
-    Raises `CheckpointMismatch` where names or shapes are others.
+    Raises `CheckpointMismatch` where names or shapes differ.
     """
     wanted = {name: tuple(value.shape) for name, value in parameters.items()}
     stored = {name: tuple(value.shape) for name, value in tensors.items()}
@@ -82,9 +82,9 @@ def load_weights(
 
 
 def read_last(
-    run: TrainingRun, world: World
+    run: TrainingRun, processes: ProcessGroup
 ) -> tuple[Normalization, PolicyShape, TrainerState, dict[str, Tensor]]:
-    """What a run goes on from, read on rank 0 and sent to the others.
+    """The state to resume from, read on rank 0 and sent to the other processes.
 
     Raises `CheckpointIncomplete` or `CheckpointMismatch`.
     """
@@ -93,7 +93,7 @@ def read_last(
     def read() -> tuple[Normalization, PolicyShape, TrainerState]:
         checkpoint = load_policy(run.last)
         state, own = read_trainer(run.last)
-        tensors.update(own)  # not pickled with the rest, but sent one by one
+        tensors.update(own)  # sent one by one, not pickled with the rest
         return checkpoint.normalization, checkpoint.shape, state
 
-    return *world.shared(read), world.tensors(tensors)
+    return *processes.shared(read), processes.tensors(tensors)

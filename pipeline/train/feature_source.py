@@ -1,4 +1,4 @@
-"""Where a training's features come from: the seam between one loop and its two ways."""
+"""Where the features of a training come from: the store, or a model that learns."""
 
 from collections.abc import Collection, Iterable, Mapping
 from pathlib import Path
@@ -13,28 +13,27 @@ from pipeline.train.batches import BatchIndices, DeviceStore, Prefetch, Windows
 
 
 class FeatureSource:
-    """What stands before a policy in training: nothing, as here, or a model that still learns.
+    """Features from the store; only the policy is trained and saved.
 
-    Here features come from the store, and the policy is all that is trained, kept and saved. The
-    wide fields of a batch that `on_device` names live on the device that is fed; they are copied to
-    it when the first batches are asked for, once for all feeds.
+    A subclass puts a model before the policy. The wide fields of a batch that `on_device` names
+    live on the device; they are copied there with the first feed, once for all feeds.
     """
 
     identity: Mapping[str, Any] = {}
-    """JSON: what else decides the numbers of the run; empty where the params say it all."""
+    """JSON of what else decides the numbers of the run; empty where only the params do."""
     eval_ticks: int | None = None
     """Ticks of val evaluated at most during training; None: the trainer's own limit."""
 
     def __init__(self, store: FeatureStore, on_device: Collection[str] = (), *notes: str) -> None:
         self.store = store
         self.notes = notes
-        """What to say of it, as lines for the user."""
+        """Lines for the user."""
         self._on_device = on_device
         self._resident: DeviceStore | None = None
 
     @property
     def golden(self) -> tuple[GoldenRow, ...]:
-        """What a checkpoint carries to prove a live model by: the store's golden rows.
+        """The store's golden rows, by which a live model proves its features.
 
         Raises `StoreIncomplete` where one is damaged.
         """
@@ -50,7 +49,7 @@ class FeatureSource:
         return module
 
     def parameter_lr(self, name: str) -> float | None:
-        """Peak learning rate of a parameter by its name in the module; None: `train_head`'s."""
+        """The peak learning rate of a parameter of the module; None: that of `train_head`."""
         return None
 
     def feed(
@@ -62,4 +61,4 @@ class FeatureSource:
         return Prefetch(self.store, plan, windows, device, resident=self._resident)
 
     def save(self, folder: Path, module: Trainable) -> None:
-        """Write what a checkpoint folder holds beside the policy's files."""
+        """Write the files that stand beside the policy's in a checkpoint folder: none."""

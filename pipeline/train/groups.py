@@ -1,4 +1,4 @@
-"""Which episodes are of one group: what is learnt from one of them is known of the others."""
+"""Groups of episodes: who has learnt from one episode of a group knows the others."""
 
 from collections.abc import Hashable, Iterator, Mapping, Sequence
 from fnmatch import fnmatchcase
@@ -10,9 +10,9 @@ from pipeline.base.errors import ConfigError
 from pipeline.store import Episode, FeatureStore, episode_name
 
 _TOLERANCE, _RESTING = 1e-3, 0.1
-"""By how much two equal actions may differ in a channel, as a share of its range in the episode.
-A channel that rests beside others varies by rounding alone: its range counts as at least a tenth of
-the widest."""
+"""How much two equal actions may differ in a channel, as a share of its range in the episode. A
+channel that rests while others move varies by rounding alone, so its range counts as at least a
+tenth of the widest."""
 
 
 def episodes_by_group(
@@ -20,14 +20,14 @@ def episodes_by_group(
     patterns: Mapping[str, Sequence[str]] | None = None,
     keys: NDArray[np.uint8] | None = None,
 ) -> dict[str, list[Episode]]:
-    """Episodes that have ticks by group, which is named by the first "source/id" in it.
+    """The episodes that have ticks, by group; a group is named by the first "source/id" in it.
 
-    Of one group are episodes whose first VL keys, whose files or whose actions are equal, whose
-    recordings name the same group, and whose "source/id" `patterns` (shell wildcards by the name of
-    a group) put together; so are any that share a group with another. Actions are equal where those
-    of as many ticks agree within 0.1 % of their range: a copy that was encoded again, so that its
-    frames and the last digits of its numbers differ, is found. Actions that never change tell
-    nothing. `keys` (vl_row, 16) stand in for the store's own.
+    Two episodes are of one group where their first VL keys, their files or their actions are equal,
+    where their recordings name the same group, where `patterns` (shell wildcards for "source/id",
+    by the name of a group) match both, and where both share a group with a third. Actions are equal
+    where two episodes of as many ticks agree within 0.1 % of their range, so that a copy encoded
+    again is recognised. Actions that never change are not compared. `keys` (vl_row, 16) replace the
+    store's own.
 
     Raises `ConfigError` where a pattern fits no episode.
     """
@@ -39,7 +39,7 @@ def episodes_by_group(
     together, first = DisjointSet(range(len(episodes))), dict[Hashable, int]()
     for index, episode in enumerate(episodes):
         row = episode.vl_rows.start
-        # The key of a row without a frame says nothing but the instruction.
+        # The key of a row without a frame only tells the instruction.
         key = keys[row].tobytes() if np.isfinite(frame_time[row]).any() else b""
         marks = [("key", key), ("content", episode.content), ("group", episode.group)]
         for mark in (mark for mark in marks if mark[1]):
@@ -55,7 +55,7 @@ def episodes_by_group(
 def _fitting(
     patterns: Mapping[str, Sequence[str]], names: Sequence[str]
 ) -> Iterator[tuple[str, int]]:
-    """Each group with the places of the names that its patterns fit."""
+    """(group, place) of each name that a pattern of the group matches."""
     for group, wanted in patterns.items():
         for pattern in wanted:
             places = [i for i, name in enumerate(names) if fnmatchcase(name, pattern)]
@@ -80,7 +80,7 @@ def _equal_actions(
         ranges = np.stack([np.ptp(own, axis=0) for own in actions])
         widest = ranges.max(axis=1, keepdims=True)
         tolerance = _TOLERANCE * np.maximum(ranges, _RESTING * widest)
-        # Cheap to compare, and equal where the actions are.
+        # Cheap to compare; equal actions have equal outlines.
         outline = np.stack([[own[0], own.mean(axis=0, dtype=float), own[-1]] for own in actions])
         moving = np.flatnonzero((widest[:, 0] > 0) & (widest[:, 0] < np.inf))
         for rank, own in enumerate(moving):

@@ -1,6 +1,6 @@
-"""What a run writes down while it goes: the loss at every step, its curves and its speed.
+"""What a run logs: the loss at every step, its curves and its speed.
 
-Every logger is handed the same rows. TensorBoard's and Weights & Biases' files carry the clock, so
+Every logger takes the same rows. Files of TensorBoard and Weights & Biases hold clock times, so
 they lie beside the logs, which DVC hashes, not in them.
 """
 
@@ -21,25 +21,24 @@ from pipeline.base.config import TrainHeadParams
 from pipeline.base.durable import disk_full_named, fresh
 from pipeline.base.errors import ConfigError
 from pipeline.base.ownership import REPORT, OutputKind, begins_with, claim, refuse_foreign
+from pipeline.train.process_group import ProcessGroup
 from pipeline.train.progress import Pace
-from pipeline.train.world import World
 
 FINISH_TIMEOUT_S = 120.0
 """How long a finished run waits for Weights & Biases to take what it has not sent yet."""
 _SPEED = "step\tsteps_per_s\tdata_wait_share\tpeak_memory_mib\ttrained_s"
 _MODULES = {"tensorboard": "torch.utils.tensorboard", "wandb": "wandb.sdk"}
-"""What is imported of a logger's package: a folder `wandb`, as that leaves where it runs, has none
-of it."""
+"""The module that proves a logger's package: the folder `wandb` that a run leaves has none."""
 
 Row = tuple[int, Mapping[str, float]]
 """A step, counted from 1, and metrics by name."""
 
 
 class History:
-    """One row of named scalars a step.
+    """A row of named scalars for each step.
 
-    Rows stay on the device until `settle`: reading a scalar at every step would make the CPU wait
-    for the GPU at every step.
+    Rows stay on the device until `settle`: reading them at every step would make the CPU wait for
+    the GPU.
     """
 
     def __init__(
@@ -55,7 +54,7 @@ class History:
         self._pending.append(values)
 
     def settle(self) -> int | None:
-        """Fetch what is pending; the index of the first step with a NaN or inf, if there is one."""
+        """Fetch the pending rows; returns the first step with a NaN or inf, or None."""
         if not self._pending:
             return None
         first = len(self._settled)
@@ -89,20 +88,20 @@ class Logger(Protocol):
     """Takes the rows of a run, in the order of their steps."""
 
     note: str
-    """Where to look, as a line for the user."""
+    """A line for the user: where to look."""
 
     def write(self, step: int, metrics: Mapping[str, float]) -> None:
         """Add a point, at a step counted from 1, to each of these curves."""
 
     def close(self, finished: bool) -> None:
-        """End: the run is finished, or was stopped and may go on."""
+        """End the log of a run that is finished, or was stopped and may be resumed."""
 
 
 class CurveFiles:
     """Curves as DVC plots them: `plots/metrics/<name>.tsv`, the newest values in `metrics.json`.
 
-    As dvclive writes them, which itself looks for git and DVC around the working directory: it
-    fails in a repository without a commit and runs `dvc init` in one that does not use DVC.
+    The files are those of dvclive. dvclive itself fails in a repository without a commit and runs
+    `dvc init` in one that does not use DVC.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -132,15 +131,15 @@ class CurveFiles:
         (self._folder / "metrics.json").write_text(f"{text}\n", encoding="utf-8")
 
     def close(self, finished: bool) -> None:
-        """Nothing: every row is written when it comes."""
+        """Does nothing: `write` writes every row at once."""
 
 
 class TensorBoard:
     """Event files in `folder`, of which the newest holds the whole run.
 
-    The rows of before a stop are handed in again (`TrainingLog`), so each start tells TensorBoard
-    to forget the files before it (`purge_step`): no step stands twice, nor any of a run before.
-    They are not removed, for a TensorBoard that is looking at one would look there for ever.
+    `TrainingLog` writes the earlier rows again after a stop, so each start tells TensorBoard to
+    forget the files before it (`purge_step`): no step appears twice. The files stay, because a
+    running TensorBoard would wait for ever for one that is gone.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -160,11 +159,11 @@ class TensorBoard:
 
 
 class WandB:
-    """A run of Weights & Biases, which goes on where this one was stopped.
+    """A run of Weights & Biases, which resumes when the training does.
 
-    Its id lies in `<folder>/id` while a run of this folder may go on; rows that the service has are
-    not sent again. `WANDB_MODE=offline` keeps everything in `folder`. Raises `ConfigError` where a
-    run cannot begin; what cannot be sent later never stops a training.
+    `<folder>/id` holds its id; rows that the service has are not sent again. With
+    `WANDB_MODE=offline` everything stays in `folder`. Raises `ConfigError` where a run cannot
+    begin; a failure to send never stops a training.
     """
 
     def __init__(self, folder: Path, params: TrainHeadParams, resumed: bool) -> None:
@@ -192,18 +191,18 @@ class WandB:
                 "later), or take wandb out of train_head.loggers."
             ) from None
         self._from = self._run.starting_step
-        if self._run.offline:  # where it warns of whoever asks for the address
+        if self._run.offline:  # whose `url` warns
             self.note = f"wandb is offline; wandb sync {self._run.settings.sync_dir} sends the run"
         else:
             self.note = f"live: {self._run.url}"
 
     def write(self, step: int, metrics: Mapping[str, float]) -> None:
-        """Send a point of each, unless it is there from before a stop."""
+        """Send a point of each, unless the service has it from before a stop."""
         if step >= self._from:
             self._run.log(dict(metrics), step=step)
 
     def close(self, finished: bool) -> None:
-        """Send the rest, for at most `FINISH_TIMEOUT_S`, and say where that fails."""
+        """Send the rest within `FINISH_TIMEOUT_S`; prints a line where that fails."""
         import wandb
 
         try:
@@ -213,7 +212,7 @@ class WandB:
 
 
 def _run_id(path: Path, resumed: bool) -> str:
-    """That of the run that goes on; a new one for a new run."""
+    """The id in this file for a resumed run; a new one for a new run."""
     if resumed and path.exists():
         return path.read_text(encoding="ascii").strip()
     path.write_text(identifier := uuid4().hex[:16], encoding="ascii")
@@ -245,22 +244,22 @@ def open_loggers(params: TrainHeadParams, resumed: bool) -> list[Logger]:
 
 
 def _beside(logs: Path, name: str) -> Path:
-    """Where that lies which carries the clock: DVC hashes all that is in the logs."""
+    """A place beside the logs, for what holds clock times: DVC hashes the logs."""
     return logs.with_name(f"{logs.name}.{name}")
 
 
 def speed_file(logs: Path) -> Path:
-    """Where a training writes its speed."""
+    """The file of a training's speed."""
     return _beside(logs, "speed.tsv")
 
 
 class TrainingLog(AbstractContextManager["TrainingLog"]):
-    """Hands the same rows to every logger, and keeps them.
+    """Writes the same rows to every logger, and keeps them.
 
-    What came before a stop is given back as `earlier` and written again: DVC may have deleted the
-    folder since, and a run that was killed has logged steps beyond its last checkpoint. Speed and
-    memory since the last start go to `speed_file`, so that the folder, which DVC tracks, holds
-    nothing of the clock. Raises `DiskFull`.
+    Rows from before a stop come as `earlier` and are written again: DVC may have deleted the folder
+    since, and a killed run has logged steps beyond its last checkpoint. Speed and memory since the
+    last start go to `speed_file`, so that the folder, which DVC tracks, holds no clock time. Raises
+    `DiskFull`.
     """
 
     def __init__(
@@ -277,7 +276,7 @@ class TrainingLog(AbstractContextManager["TrainingLog"]):
             self.write(step, metrics)
 
     def write(self, step: int, metrics: Mapping[str, float]) -> None:
-        """Add a point to each of these curves, everywhere."""
+        """Add a point to each of these curves, in every logger."""
         self.rows.append((step, dict(metrics)))
         with disk_full_named(self._folder):
             for logger in self._loggers:
@@ -294,7 +293,7 @@ class TrainingLog(AbstractContextManager["TrainingLog"]):
 
     def __exit__(self, kind: type[BaseException] | None, *raised: object) -> None:
         with disk_full_named(self._folder), ExitStack() as closing:
-            # Whatever one logger does, the others are closed too.
+            # Where a logger fails, the others are closed too.
             for logger in reversed(self._loggers):
                 closing.callback(logger.close, kind is None)
             closing.callback(self._speed.close)
@@ -302,11 +301,11 @@ class TrainingLog(AbstractContextManager["TrainingLog"]):
 
 @contextmanager
 def open_log(
-    params: TrainHeadParams, resumed: bool, earlier: Iterable[Row], world: World
+    params: TrainHeadParams, resumed: bool, earlier: Iterable[Row], processes: ProcessGroup
 ) -> Generator[TrainingLog | None]:
-    """Rank 0's log, to the loggers of `params`, which says where to look; None on the others.
+    """The log with the loggers of `params` on rank 0, which prints where to look; None elsewhere.
 
-    Where it cannot begin, no process waits for another. Raises `ConfigError` or `DiskFull`.
+    Where it cannot begin, all processes end. Raises `ConfigError` or `DiskFull`.
     """
     opened: list[TrainingLog] = []
     with ExitStack() as stack:
@@ -315,7 +314,7 @@ def open_log(
             with disk_full_named(params.logs):
                 loggers = open_loggers(params, resumed)
             opened.append(stack.enter_context(TrainingLog(params.logs, loggers, earlier)))
-            world.say(*(logger.note for logger in loggers))
+            processes.say(*(logger.note for logger in loggers))
 
-        world.shared(begin)
+        processes.shared(begin)
         yield opened[0] if opened else None

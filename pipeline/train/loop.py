@@ -36,13 +36,14 @@ from pipeline.train.optimizer import (
     trainable,
 )
 from pipeline.train.predictions import predict
+from pipeline.train.process_group import ProcessGroup, deferred_interrupt, process_device
 from pipeline.train.progress import Progress, describe_data, peak_memory_bytes
 from pipeline.train.run import TrainingRun, policy_shape
 from pipeline.train.sampling import Plan, StepPart
 from pipeline.train.scores import action_space, compare
-from pipeline.train.split import Split, source_of, split_parts
+from pipeline.train.split import Split
 from pipeline.train.statistics import fit_normalization
-from pipeline.train.world import World, deferred_interrupt, process_device
+from pipeline.train.training_data import source_of, split_parts
 
 LOG_EVERY = 10
 EVALUATION_TICKS = 1000
@@ -50,13 +51,13 @@ EVALUATION_TICKS = 1000
 
 
 class Trainer:
-    """A policy in training: begins anew or goes on from the run's last checkpoint.
+    """A policy in training, begun anew or resumed from the run's last checkpoint.
 
-    What a step does follows from the seed and its number alone (its ticks, its dropout, its noise,
-    its learning rate), so that a run that was stopped at any checkpoint continues, on a CPU with as
-    many threads, to the same losses and weights bit for bit; and N processes, each with its parts
-    of every step, follow the curve of one that accumulates N times as much, within float noise.
-    Within a `process_group` every process makes one, and all call the same methods.
+    A step (its ticks, dropout, noise and learning rate) follows from the seed and its number alone.
+    So a run that was stopped at any checkpoint continues to the same losses and weights, bit for
+    bit on a CPU with as many threads. N processes follow the curve of one that accumulates N times
+    as much, within float noise. Within a `process_group` every process makes a trainer, and all
+    call the same methods.
     """
 
     def __init__(
@@ -68,11 +69,11 @@ class Trainer:
         source: FeatureSource | None = None,
     ) -> None:
         self.store, self.params, self.split, self.run = store, params, split, run
-        self.world = World.current()
+        self.processes = ProcessGroup.current()
         self.device = process_device(params.device)
         self.source = source or FeatureSource(store, *choose_feed(params.feed, store, self.device))
-        self.golden = self.source.golden  # now: a damaged one stops a run before it begins
-        self.plan = Plan(store, params, split, self.world, run.section)
+        self.golden = self.source.golden  # read now: a damaged row stops a run before it begins
+        self.plan = Plan(store, params, split, self.processes, run.section)
         self.windows = Windows.of(params)
         self.step = 0
         if params.early_stopping is not None and not len(split.val):
@@ -86,7 +87,7 @@ class Trainer:
         self._earlier: Sequence[Row] = ()
         self._trained_s = 0.0
         if run.status == "resumed":
-            self.normalization, self.shape, state, tensors = read_last(run, self.world)
+            self.normalization, self.shape, state, tensors = read_last(run, self.processes)
             self._build()
             load_weights(self.learning, of_kind(tensors, "weights"), run.last)
             load_weights(self.average.weights, of_kind(tensors, "average"), run.last)
@@ -96,12 +97,12 @@ class Trainer:
             self.step, self._earlier, self._trained_s = state.step, state.rows, state.trained_s
         else:
             fitted = partial(fit_normalization, store, split.train, self.windows)
-            self.normalization = self.world.shared(fitted)
+            self.normalization = self.processes.shared(fitted)
             self.shape = policy_shape(store, self.normalization)
             self._build()
 
     def _build(self) -> None:
-        """The policy behind its features, its optimizer, and the average of what learns.
+        """Build the policy behind its features, its optimizer and the average of what learns.
 
         All processes begin with the weights of rank 0 and stay equal.
         """
@@ -110,8 +111,8 @@ class Trainer:
         policy = Policy(params, self.shape, self.normalization)
         self.module = self.source.attach(policy).to(self.device).train()
         self.learning = trainable(self.module)
-        """The parameters that learn, by name; the others are neither averaged nor kept."""
-        self.world.spread(value.data for value in self.learning.values())
+        """The parameters that learn, by name; the others are neither averaged nor saved."""
+        self.processes.spread(value.data for value in self.learning.values())
         rates = peak_rates(self.module, self.source, params)
         self.optimizer = make_optimizer(self.module, params, rates)
         self.average = WeightAverage(self.module, params.ema_decay)
@@ -127,26 +128,26 @@ class Trainer:
 
     @property
     def averaged(self) -> Trainable:
-        """The module with the averaged weights, which is evaluated and kept."""
+        """The module with the averaged weights, which is evaluated and saved."""
         assert isinstance(self.average.module, Trainable)
         return self.average.module
 
     def fit(self) -> None:
-        """Train to the last step, or until nothing gets better, and finish the run.
+        """Train to the last step or to an early stop, and finish the run.
 
         Raises `NumericsError` on a loss or gradient that is not finite, naming the step and its
-        ticks. On Ctrl-C or SIGTERM, to whichever process, all end the step, the last checkpoint is
-        written and `KeyboardInterrupt` raised.
+        ticks. On Ctrl-C or SIGTERM to any process, all end the step, write the last checkpoint and
+        raise `KeyboardInterrupt`.
         """
-        steps, shown = range(self.step, self.params.max_steps), self.world.first
+        steps, shown = range(self.step, self.params.max_steps), self.processes.first
         resumed = self.run.status == "resumed"
         with (
             deferred_interrupt() as interrupted,
-            open_log(self.params, resumed, self._earlier, self.world) as log,
+            open_log(self.params, resumed, self._earlier, self.processes) as log,
             self.source.feed(self.plan.parts_of(steps), self.windows, self.device) as feed,
             Progress(feed, self.device, steps, self._trained_s, shown) as progress,
         ):
-            self.world.shared(self.run.begin)
+            self.processes.shared(self.run.begin)
             batches = iter(feed)
             while not self._over:
                 stopped = self._train_step(batches, interrupted)
@@ -159,20 +160,20 @@ class Trainer:
                     self._save_last(log, progress)
                 if stopped and not self._over:
                     raise KeyboardInterrupt
-        self.world.shared(self.run.finish)
+        self.processes.shared(self.run.finish)
         if self.stopping.exhausted:
             stalled = self.stopping.stalled
-            self.world.say(
+            self.processes.say(
                 f"stopped early at step {self.step}: {stalled} evaluations without a better one"
             )
-        self.world.say(
+        self.processes.say(
             f"trained {self.step} steps in {duration(progress.trained_s)} "
             f"({self.step / max(progress.trained_s, 1e-9):.1f} steps/s), "
             f"peak memory {size(peak_memory_bytes(self.device))}"
         )
 
     def summary(self) -> list[str]:
-        """What is trained, from what and on what, as lines for the user."""
+        """Lines for the user: what is trained, from what data and on which device."""
         lines = describe_cost(self.policy)
         if self.module is not self.policy:
             table = ", ".join(f"{part} {n:,}" for part, n in self.module.parameter_table())
@@ -181,7 +182,7 @@ class Trainer:
         whole = sum(value.numel() for value in self.module.parameters())
         if learning < whole:
             lines.append(f"learns {learning:,} of {whole:,} parameters")
-        several = f" on {self.world.size} processes" if self.world.size > 1 else ""
+        several = f" on {self.processes.size} processes" if self.processes.size > 1 else ""
         precision = "bfloat16 autocast" if self._bfloat16 else "float32"
         return [
             *lines,
@@ -199,7 +200,7 @@ class Trainer:
     def _train_step(
         self, batches: Iterator[tuple[BatchIndices, Batch]], interrupted: Callable[[], bool]
     ) -> bool:
-        """One step of all processes; whether one of them was told to stop."""
+        """Take one step with all processes; whether one of them was interrupted."""
         scalars, stopped = self.learn(islice(batches, len(self.plan.own)), interrupted)
         self.history.add(scalars)
         self.step += 1
@@ -222,16 +223,16 @@ class Trainer:
             for name, value in self._backward(part, batch).items():
                 scalars[name] = scalars[name] + value if name in scalars else value
         learning = self.learning.values()
-        stopped = self.world.sum_gradients(learning, scalars, interrupted())
+        stopped = self.processes.sum_gradients(learning, scalars, interrupted())
         norm = torch.nn.utils.clip_grad_norm_(learning, self.params.grad_clip)
         self.optimizer.step()
         self.average.update(self.step + 1)
         return {"loss": scalars.pop("loss"), "grad_norm": norm, **scalars}, stopped
 
     def _backward(self, part: BatchIndices, batch: Batch) -> dict[str, Tensor]:
-        """Add a part's gradients; its loss and the parts of it, each by its share of the whole."""
+        """Add a part's gradients; returns its loss and the loss's parts, times its share."""
         assert isinstance(part, StepPart), "a feed hands back the entries of its plan"
-        # Dropout and sampled noise of a part depend on nothing that came before it.
+        # So dropout and sampled noise of a part depend on no part before it.
         torch.manual_seed(part.seed)
         action, valid = batch.action, batch.action_valid
         if self.params.terminal_stop:
@@ -255,27 +256,27 @@ class Trainer:
             log.write_speed(self.step, pace)
             progress.show(pace, means["loss"], rate)
 
-        self.world.shared(write)
+        self.processes.shared(write)
 
     def _evaluate(self, log: TrainingLog | None, progress: Progress) -> None:
         """Evaluate the averaged weights; save them where they are the best so far."""
         self._check_finite()
         with progress.paused():
-            metrics = self.world.shared(lambda: self._measure(log))
+            metrics = self.processes.shared(lambda: self._measure(log))
             best = not metrics or self.stopping.take(metrics["val/error"])
-            if metrics and self.world.first:
+            if metrics and self.processes.first:
                 tqdm.write(
                     f"step {self.step}: train loss {self.history.last('loss'):.4f}, val error "
                     f"{metrics['val/error']:.4f} of the training std"
                     f"{' (best so far)' if best else ''}"
                 )
             if best:
-                self.world.shared(lambda: self._save(self.run.best, metrics))
+                self.processes.shared(lambda: self._save(self.run.best, metrics))
 
     def _measure(self, log: TrainingLog | None) -> dict[str, float]:
-        """The metrics on val, written down; none where that is empty. Test is never looked at.
+        """Log and return the metrics on val; none where val is empty. Test is never read.
 
-        `val/error` in training standard deviations, `val/<group>` in the group's unit.
+        `val/error` is in training standard deviations, `val/<group>` in the group's unit.
         """
         assert log is not None
         ticks = evenly(self.split.val, self.source.eval_ticks or EVALUATION_TICKS)
@@ -310,7 +311,7 @@ class Trainer:
             )
 
     def _save_last(self, log: TrainingLog | None, progress: Progress) -> None:
-        """Save the newest weights, with everything that going on from them takes."""
+        """Save the newest weights and the trainer's state."""
         self._check_finite()
 
         def save() -> None:
@@ -334,7 +335,7 @@ class Trainer:
             self._save(self.run.last, {"train/loss": self.history.last("loss")}, write_state)
 
         with progress.paused():
-            self.world.shared(save)
+            self.processes.shared(save)
 
     def _save(
         self,
@@ -342,7 +343,7 @@ class Trainer:
         metrics: Mapping[str, float],
         write_state: Callable[[Path], None] = lambda folder: None,
     ) -> None:
-        """Put the averaged weights into a checkpoint folder. Raises `DiskFull`."""
+        """Save the averaged weights as a checkpoint folder. Raises `DiskFull`."""
         checkpoint = PolicyCheckpoint(
             params=self.params,
             shape=self.shape,
@@ -370,25 +371,25 @@ def stand_still(
     valid: Bool[Tensor, "batch horizon"],
     moves: Bool[Tensor, " action"],
 ) -> tuple[Float[Tensor, "batch horizon action"], Bool[Tensor, "batch horizon"]]:
-    """The chunk beyond an episode's end as something to learn, and what of it counts: everything.
+    """The chunk with a standstill beyond the episode's end, and the mask of valid steps: all.
 
-    A robot that is to stand still moves by zero: so deltas and velocities, which `moves` marks,
-    become 0. Where to be, as a gripper's position, repeats the last one, as the store has it.
+    Channels that `moves` marks (deltas and velocities) become 0 there. Positions, such as a
+    gripper's, repeat the last one, as the store has it.
     """
     return action.masked_fill(~valid.unsqueeze(-1) & moves, 0.0), torch.ones_like(valid)
 
 
 @dataclass
 class EarlyStopping:
-    """The best error on val so far and how many evaluations have come since."""
+    """The best error on val so far, and the evaluations since."""
 
     patience: int | None
-    """Evaluations without a better one after which a run ends; None never ends it."""
+    """A run ends after so many evaluations without a better one; with None it never does."""
     best_error: float | None = None
     stalled: int = 0
 
     def take(self, error: float) -> bool:
-        """Take in the error of an evaluation; whether it is the best so far."""
+        """Count the error of an evaluation; whether it is the best so far."""
         better = self.best_error is None or error < self.best_error
         if better:
             self.best_error = error

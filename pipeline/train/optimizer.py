@@ -25,10 +25,10 @@ def make_optimizer(
 ) -> torch.optim.AdamW:
     """AdamW that decays matrices and kernels, but neither biases, norms nor embeddings.
 
-    (Loshchilov and Hutter, "Decoupled weight decay regularization", 2019; which parameters to
-    leave out follows common practice since BERT: shrinking a gain or an offset regularises
-    nothing.) `peaks` has the peak learning rate of each parameter by name; one that is not named
-    has `params.lr`. Frozen parameters are left out.
+    Loshchilov and Hutter, "Decoupled weight decay regularization", 2019; which parameters do not
+    decay follows common practice since BERT: shrinking a gain or an offset regularises nothing.
+    `peaks` has the peak learning rate of a parameter by name; the others have `params.lr`. Frozen
+    parameters are left out.
     """
     learning = trainable(module)
     groups: dict[tuple[float, float], list[nn.Parameter]] = {}
@@ -50,7 +50,7 @@ def peak_rates(
 ) -> dict[str, float]:
     """The peak learning rate of each parameter that learns, by name.
 
-    The source's word comes first, then `sensor_lr` for the sensor encoder, then `lr`.
+    The source's rate comes first, then `sensor_lr` for the sensor encoder, then `lr`.
     """
     encoders = source.policy_of(module).encoders
     sensor = {*encoders["sensor"].parameters()} if "sensor" in encoders else set[nn.Parameter]()
@@ -112,7 +112,7 @@ def optimizer_tensors(optimizer: torch.optim.Optimizer, module: nn.Module) -> di
 def restore_optimizer(
     optimizer: torch.optim.Optimizer, module: nn.Module, tensors: Mapping[str, Tensor]
 ) -> None:
-    """Lay the tensors of `optimizer_tensors` into a fresh optimizer over the same module."""
+    """Copy the tensors of `optimizer_tensors` into a fresh optimizer over the same module."""
     parameters = dict(module.named_parameters())
     for key, value in tensors.items():
         name, _, entry = key.rpartition("/")
@@ -124,13 +124,12 @@ def restore_optimizer(
 
 
 class WeightAverage:
-    """A second module whose weights trail those of a first; it is the one that is evaluated.
+    """A copy of a module whose weights are a moving average; the copy is evaluated and saved.
 
-    After update t (from 1): average += (1 - d) (weights - average), d = min(decay, t / (t + 9)):
-    the warm-up of Tarvainen and Valpola's mean teacher (2017) in the form of TensorFlow's
-    ExponentialMovingAverage, without which a short run would still average in its random start.
-    What does not learn is shared with the first, not copied: frozen parameters (those of a
-    vision-language model may be gigabytes) and buffers (normalisation, group weights).
+    After update t (from 1): average += (1 - d) (weights - average), d = min(decay, t / (t + 9)).
+    This warm-up of Tarvainen and Valpola's mean teacher (2017), in the form of TensorFlow's
+    ExponentialMovingAverage, keeps the random start out of a short run's average. Frozen parameters
+    (a vision-language model's may be gigabytes) and buffers are shared with the module.
     """
 
     def __init__(self, module: nn.Module, decay: float) -> None:
@@ -139,35 +138,35 @@ class WeightAverage:
         self.module = copy.deepcopy(module, shared).requires_grad_(False).eval()
         learning = trainable(module)
         self.weights = {n: v for n, v in self.module.named_parameters() if n in learning}
-        """The averaged parameters by name: those that learn in the first."""
-        # At every step: a walk through a vision-language model's modules would take its time.
+        """The averaged parameters by name: those that learn in the module."""
+        # Listed once: a walk through a vision-language model at every step would be slow.
         self._learning, self._averaged = tuple(learning.values()), tuple(self.weights.values())
         self._decay = decay
 
     @torch.no_grad()
     def update(self, updates: int) -> None:
-        """Take in the first's weights after the `updates`-th optimizer step, counted from 1."""
+        """Average in the module's weights after optimizer step `updates`, counted from 1."""
         decay = min(self._decay, updates / (updates + 9))
         get_ema_multi_avg_fn(decay)(self._averaged, self._learning, 0)
 
 
 def compiled(loss: Callable[..., Any], device: torch.device) -> Callable[..., Any]:
-    """The same function, compiled at its first call, with the random numbers of eager torch.
+    """The function, compiled at its first call, with the random numbers of eager torch.
 
-    It raises `ConfigError` where the code that torch writes for the device (C++ for a CPU, Triton
-    for a GPU) does not compile.
+    That call raises `ConfigError` where torch's code for the device (C++ for a CPU, Triton for a
+    GPU) does not compile.
     """
-    from torch._dynamo.exc import BackendCompilerFailed  # it costs a second, and nobody else
+    from torch._dynamo.exc import BackendCompilerFailed  # imported here: it takes a second
 
-    # Inductor would draw dropout and noise from a generator of its own.
+    # Without it Inductor draws dropout and noise from a generator of its own.
     inner = torch.compile(loss, options={"fallback_random": True})
 
     def checked(*arguments: Any) -> Any:
         try:
             return inner(*arguments)
         except BackendCompilerFailed as error:
-            told = (line.strip() for line in str(error).splitlines())
-            why = next((line for line in told if line and not line.startswith("backend=")), "")
+            lines = (line.strip() for line in str(error).splitlines())
+            why = next((line for line in lines if line and not line.startswith("backend=")), "")
             raise ConfigError(
                 f"train_head.compile: torch {torch.__version__} fails to compile this policy for "
                 f"{device}: {why}. It takes a C++ compiler (g++ or clang++, or the one that CXX "

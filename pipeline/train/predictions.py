@@ -1,4 +1,4 @@
-"""What a policy does at recorded ticks, beside what was recorded there."""
+"""The actions of a policy at recorded ticks, beside the recorded ones."""
 
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import AbstractContextManager
@@ -21,12 +21,13 @@ Actions = NDArray[np.float32]
 FeedMaker = Callable[
     [Sequence[BatchIndices]], AbstractContextManager[Iterable[tuple[BatchIndices, Batch]]]
 ]
-"""Makes the feed of a plan: what a policy is to see at these ticks."""
+"""Makes the feed of a plan: the batches that a policy sees at these ticks."""
 Watch = Callable[[Actions, Actions, NDArray[np.bool_]], None]
-"""Is shown all chunks (sample, tick, horizon, action_dim) of a batch, and what was recorded."""
+"""Called with all chunks (sample, tick, horizon, action_dim) of a batch, the recorded chunks and
+their valid steps."""
 _SEED = 0
 _CHUNKS_AT_ONCE = 1024
-"""Chunks sampled in one forward pass at most, but one a tick: what bounds the memory."""
+"""Chunks sampled in one forward pass at most, and at least one a tick: bounds the memory."""
 
 
 @dataclass(frozen=True)
@@ -40,12 +41,11 @@ class Predictions:
     episodes: NDArray[np.int64]
     """(tick,) index of each tick's episode in the store."""
     predicted: Actions
-    """Of a policy that samples, its first sample: what a robot would execute."""
+    """Of a policy that samples, its first sample, which a robot would execute."""
     recorded: Actions
     valid: NDArray[np.bool_]
     sampled: Actions | None = None
-    """The absolute error of one sample, the mean over independent samples; None where it is that
-    of `predicted`."""
+    """The absolute error of a sample, averaged over independent samples; None with one sample."""
 
     @property
     def error(self) -> Actions:
@@ -66,16 +66,15 @@ def predict(
     feed: FeedMaker | None = None,
     watch: Watch | None = None,
 ) -> Predictions:
-    """What the policy, in evaluation mode, does at these ticks, beside what was recorded.
+    """The chunks of the policy, in evaluation mode, at these ticks, beside the recorded ones.
 
-    A robot executes one sample, so the errors are those of one: of a stochastic policy their mean
-    over `samples` independent ones, for less noise, and never those of the samples' mean. Their
-    noise comes from one generator of fixed seed, batch after batch: the same weights give the same
-    figures for the same ticks, `samples` and `batch_size`, and a stochastic policy others for
-    another `batch_size`. Runs on the policy's device, which sees what `feed` hands out: by default
-    the store as it is, gathered ahead. `watch` is shown all samples. `progress` shows a bar on a
-    terminal. Raises `NumericsError`, naming episode, tick and time, where a prediction or a
-    recorded action is NaN or infinite.
+    A robot executes one sample, so errors are those of one sample: of a stochastic policy the mean
+    error over `samples` independent samples, never the error of their mean. Noise comes from one
+    generator of fixed seed, batch after batch: the same weights, ticks, `samples` and `batch_size`
+    give the same figures; another `batch_size` changes those of a stochastic policy. Runs on the
+    policy's device, on the batches of `feed`, by default the store's. `watch` is called with all
+    samples. `progress` shows a bar on a terminal. Raises `NumericsError`, naming episode, tick and
+    time, where a prediction or a recorded action is NaN or infinite.
     """
     device = next(policy.parameters()).device
     # On the CPU, so that every device is given the same noise.
@@ -116,7 +115,7 @@ def predict(
 def _sample(
     policy: Trainable, batch: Batch, samples: int, generator: Generator
 ) -> Float[np.ndarray, "sample tick horizon action_dim"]:
-    """Independent chunks of each tick in float32: one, where the policy does not sample."""
+    """Independent chunks of each tick in float32; one where the policy does not sample."""
     samples = samples if policy.stochastic else 1
     at_once = max(1, _CHUNKS_AT_ONCE // len(batch))
     parts = [
@@ -136,7 +135,7 @@ def _check_finite(
     bad = first_non_finite(actions, valid)
     if bad is not None:
         row, ahead, dimension = bad
-        # What was recorded lies at a tick of its own; what is predicted, at the tick it is of.
+        # A recorded action has a tick of its own; a prediction has the tick it was made at.
         tick = int(ticks[row]) + (0 if valid is None else ahead)
         name = store.streams["action"]["names"][dimension]
         raise NumericsError(

@@ -1,4 +1,4 @@
-"""What a run says while it goes: what it trains and from what, how far it is, how fast it goes."""
+"""What a run prints: its data when it begins, then its progress and speed."""
 
 import resource
 import sys
@@ -17,10 +17,11 @@ from pipeline.policy.observation import PolicyShape
 from pipeline.store import FeatureStore
 from pipeline.train.batches import Prefetch
 from pipeline.train.sampling import ticks_by_source
-from pipeline.train.split import Split, split_parts
+from pipeline.train.split import Split
+from pipeline.train.training_data import split_parts
 
 EVERY_S = 60.0
-"""Between two lines where there is no terminal."""
+"""Seconds between two lines where there is no terminal."""
 
 
 class Pace(NamedTuple):
@@ -37,9 +38,9 @@ class Pace(NamedTuple):
 
 
 class Progress(AbstractContextManager["Progress"]):
-    """Counts steps on stderr, `shown` on one process of several: a bar, or a line a minute.
+    """Counts steps on stderr with a bar, or a line a minute; only one process shows it.
 
-    And measures how fast they go: steps and their data, not evaluations and checkpoints.
+    It also measures the speed of steps and their data, without evaluations and checkpoints.
     """
 
     def __init__(
@@ -67,7 +68,7 @@ class Progress(AbstractContextManager["Progress"]):
         self._bar.update()
 
     def read(self) -> Pace:
-        """The figures at this step."""
+        """The pace since the last call."""
         step, trained, waited = self._last_reading
         self._last_reading = self._step, self.trained_s, self._feed.waited_s
         elapsed = max(self.trained_s - trained, 1e-9)
@@ -76,7 +77,7 @@ class Progress(AbstractContextManager["Progress"]):
         return Pace(pace, share, peak_memory_bytes(self._device), self.trained_s)
 
     def show(self, pace: Pace, loss: float, lr: float) -> None:
-        """Show these behind the bar; without one in a line, where the last is a minute old."""
+        """Show these behind the bar; without a bar in a line, once the last is a minute old."""
         self._bar.set_postfix(
             loss=f"{loss:.4f}",
             lr=f"{lr:.1e}",
@@ -102,7 +103,7 @@ class Progress(AbstractContextManager["Progress"]):
 
     @contextmanager
     def paused(self) -> Generator[None]:
-        """Within it the watch stands still."""
+        """Within it no time is counted."""
         self._before, self._since = self.trained_s, None
         yield
         self._since = time.perf_counter()
@@ -112,9 +113,9 @@ class Progress(AbstractContextManager["Progress"]):
 
 
 def peak_memory_bytes(device: torch.device) -> int:
-    """The most that this process has held: allocated on its GPU, else resident in memory.
+    """The most bytes that this process has held: allocated on its GPU, else resident in memory.
 
-    What is resident includes the pages of the store that are mapped and in memory.
+    Resident bytes include the mapped pages of the store that are in memory.
     """
     if device.type == "cuda":
         return torch.cuda.max_memory_allocated(device)
@@ -125,9 +126,9 @@ def peak_memory_bytes(device: torch.device) -> int:
 def describe_data(
     store: FeatureStore, shape: PolicyShape, params: TrainHeadParams, split: Split
 ) -> list[str]:
-    """Lines on the store, its streams and the split; warnings last.
+    """Lines for the user on the store, its streams and the split.
 
-    Those are of what the store has and the training episodes have not: a source, a stream.
+    Warnings come last: of a source or a stream that the store has and the training episodes lack.
     """
     slots, dim = store.feature_shape
     sides = split_parts(store, split).values()

@@ -1,7 +1,7 @@
-"""Where a training run lies on disk, what decides its numbers, and whether it goes on or is done.
+"""A training run on disk: its place, what decides its numbers, whether it is resumed or finished.
 
 A run works in `<output>.part` (`run.json`, `best/`, `last/`) and renames it to `<output>` when it
-is finished, so that a stopped run goes on. Without torch, which takes over a second to import.
+is finished; a stopped run is resumed there. No torch, which takes over a second to import.
 """
 
 import hashlib
@@ -43,13 +43,13 @@ from pipeline.policy.document import PolicyDocument
 from pipeline.policy.normalization import Normalization
 from pipeline.policy.shape import PolicyShape, channel_kinds
 from pipeline.store import FeatureStore, build_lock
-from pipeline.train.split import list_differences, source_of
+from pipeline.train.training_data import list_differences, source_of
 
 RUN, BEST, LAST = "run.json", "best", "last"
 TRAINER_WEIGHTS, TRAINER_DOCUMENT = "trainer.safetensors", "trainer.json"
 TRAINER_VERSION = 4
-"""Raised with every change of code that changes the numbers of a run: part of its identity, so
-that no run goes on under code other than it began with."""
+"""Raise it with every change of code that changes the numbers of a run. It is part of the run's
+identity, so that no run is resumed by code with other numbers."""
 FREE_PARAMS = {
     "anew",
     "device",
@@ -63,13 +63,13 @@ FREE_PARAMS = {
     "store",
     "grad_accumulation",
 }
-"""Params that may change between a stop and the next start: they decide no number of the run, or
-not alone: `parts`, accumulation times processes, stands for the last."""
+"""Params that may change between a stop and the next start: they decide no number of the run. The
+last decides `parts` together with the number of processes, and `parts` is compared."""
 NOTHING: Mapping[str, Any] = MappingProxyType({})
 
 
-class Decides(Document):
-    """What of all that decided a run's numbers is used beyond being compared."""
+class RunInputs(Document):
+    """What decided the numbers of a run; only `recordings` is read, the rest is compared."""
 
     recordings: dict[Text, JsonValue]
 
@@ -78,7 +78,7 @@ class RunDocument(Document):
     """The content of `run.json`."""
 
     source: SourceDocument
-    decides: Decides
+    decides: RunInputs
 
 
 @dataclass(frozen=True)
@@ -88,10 +88,10 @@ class TrainingRun:
     output: Path
     status: Literal["new", "resumed", "finished"]
     notes: tuple[str, ...]
-    """What is there and will be done, for the user."""
+    """Lines for the user: what is there, and what will happen."""
     identity: Mapping[str, Any]
     section: str = "train_head"
-    """Of the params: the one that names this run's output, steps and rate."""
+    """The section of the params with this run's output, steps and rate."""
 
     @property
     def part(self) -> Path:
@@ -105,14 +105,14 @@ class TrainingRun:
 
     @property
     def last(self) -> Path:
-        """The newest checkpoint, with everything that going on from it takes."""
+        """The newest checkpoint, with the trainer's state."""
         return self.part / LAST
 
     def begin(self) -> None:
-        """Make room for a new run and leave its `run.json`; nothing for one that goes on.
+        """Create the part of a new run with its `run.json`; does nothing for a resumed run.
 
-        Another unfinished run is put aside to `<output>.part-old`, in place of an older one there,
-        unless it has no checkpoint. Called when nothing can be wrong with the params any more.
+        Another unfinished run that has a checkpoint moves to `<output>.part-old`, in place of an
+        older one there. Call it once the params are known to be good.
         """
         if self.status != "new":
             return
@@ -125,16 +125,17 @@ class TrainingRun:
         unmark(self.part)
 
     def finish(self) -> None:
-        """Rename the part to the output, in place of an older run, and drop what only resuming
-        takes: the optimizer's state and the weights before averaging, four times what learns."""
+        """Rename the part to the output, in place of an older run, without the trainer's state.
+
+        Only resuming takes that state, and it is four times as large as what learns.
+        """
         put_in_place(self.part, self.output, RUN_FOLDER)
         _drop_trainer_state(self.output)
 
 
 @contextmanager
 def run_lock(params: TrainHeadParams) -> Generator[None]:
-    """Hold a run's output and the folder of its curves. Raises `StoreLocked` where another run
-    works in either."""
+    """Hold a run's output and its logs. Raises `StoreLocked` where another run works in either."""
     with build_lock(params.output), build_lock(params.logs):
         yield
 
@@ -145,15 +146,13 @@ def open_run(
     extra_identity: Mapping[str, Any] = NOTHING,
     section: str = "train_head",
 ) -> TrainingRun:
-    """The run of these params on this store: new, resumed or finished.
+    """The run of these params on this store: new, resumed or finished. It changes no run.
 
-    `extra_identity` is what else decides its numbers (`FeatureSource.identity`); `section` of the
-    params is the one that errors name.
-
-    Begins nothing. A finished run with a damaged checkpoint is new: trained again, then replaced.
-    Raises `CheckpointMismatch` when an unfinished run with a checkpoint saw other features or other
-    streams, `CheckpointIncomplete` when its `run.json` is damaged, and `ConfigError` when the
-    output is something that no training wrote.
+    `extra_identity` is what else decides the numbers (`FeatureSource.identity`); `section` is the
+    section of the params that errors name. A finished run with a damaged checkpoint is new: it is
+    trained again and then replaced. Raises `CheckpointMismatch` where an unfinished run with a
+    checkpoint saw other features or streams, `CheckpointIncomplete` where its `run.json` is
+    damaged, and `ConfigError` where no training wrote the output.
     """
     output, identity = params.output, run_identity(params, store, extra_identity)
     part = _part(output)
@@ -191,8 +190,7 @@ def open_run(
 
 
 def _is_run(folder: Path) -> bool:
-    """Whether a training wrote it; a `run.json` that cannot be read is a damaged one of ours only
-    beside a checkpoint."""
+    """Whether a training wrote the folder; an unreadable `run.json` counts beside a checkpoint."""
     if _has_checkpoint(folder):
         return (folder / RUN).is_file()
     try:
@@ -206,9 +204,9 @@ RUN_FOLDER = OutputKind("a training run", _is_run)
 
 
 def finished_run(params: TrainHeadParams, path: Path) -> TrainingRun | None:
-    """The run of these params on the store at `path` where it is finished, else None.
+    """The run of these params on the store at `path` if it is finished, as `open_run` gives it.
 
-    What `open_run` gives, without torch; None where several processes train together.
+    None where it is not, and where several processes train together. Imports no torch.
     """
     together = int(os.environ.get("WORLD_SIZE", "1")) > 1
     if together or params.anew or not (params.output / RUN).exists():
@@ -219,7 +217,7 @@ def finished_run(params: TrainHeadParams, path: Path) -> TrainingRun | None:
 
 
 def _compare(part: Path, identity: Mapping[str, Any], section: str) -> str:
-    """What else the unfinished run in `part` was to be; refused where its store was another."""
+    """How the unfinished run in `part` differs from this one; refused where its store does."""
     _, prior = read_document(part / RUN, RunDocument)
     if differing := list_differences(prior["source"], identity["source"]):
         raise CheckpointMismatch(
@@ -232,7 +230,7 @@ def _compare(part: Path, identity: Mapping[str, Any], section: str) -> str:
 
 
 def _has_checkpoint(part: Path) -> bool:
-    """Whether there is a checkpoint; by its document, `<name>.old` and `<name>.new` too."""
+    """Whether there is a checkpoint, `<name>.old` and `<name>.new` included."""
     return any(path.is_file() for name in (BEST, LAST) for path in part.glob(f"{name}*/{DOCUMENT}"))
 
 
@@ -264,7 +262,7 @@ def run_identity(
 
 
 def recordings_of(store: FeatureStore) -> dict[str, Any]:
-    """Which episodes and rows a store holds, as a run remembers it."""
+    """Which episodes and rows a store holds, as `run.json` keeps it."""
     episodes = [[e.source, e.id, e.digest, len(e.ticks)] for e in store.episodes]
     digest = hashlib.blake2b(json.dumps(episodes).encode(), digest_size=16)
     digest.update(store.array("vl/key").tobytes())
@@ -274,7 +272,7 @@ def recordings_of(store: FeatureStore) -> dict[str, Any]:
 def policy_shape(store: FeatureStore, normalization: Normalization) -> PolicyShape:
     """The widths that this store gives to a policy.
 
-    A stream without statistics is absent from what the policy is trained on, so it has width 0.
+    A stream without statistics is absent from the training ticks, so it has width 0.
     """
     action, state = store.streams["action"], store.streams["state"]
     return PolicyShape(
@@ -290,20 +288,20 @@ def policy_shape(store: FeatureStore, normalization: Normalization) -> PolicySha
 
 @dataclass(frozen=True)
 class TrainedPolicy:
-    """A training run, or a checkpoint that was copied out of one, as what depends on stores."""
+    """A training run, or a checkpoint copied out of one, which may depend on a store."""
 
     folder: Path
     source: Mapping[str, Any] | None = None
-    """What its store was; None where its document is damaged."""
+    """Its store, as `source_of` describes it; None where its document is damaged."""
     recordings: Mapping[str, Any] | None = None
-    """Of a run: which episodes and rows its store held."""
+    """Of a run: the episodes and rows of its store."""
     episodes: frozenset[str] | None = None
-    """Of a checkpoint alone: digests of the files of its training and test episodes; None where it
+    """Of a single checkpoint: digests of the files of its training and test episodes; None where it
     has no test."""
     damage: str | None = None
 
     def depends_on(self, store: FeatureStore) -> str | None:
-        """How it depends on a store, for people; None where it does not."""
+        """How it depends on a store, in words; None where it does not."""
         if self.source is None or differences(self.source, source_of(store)):
             return None
         if self.recordings is not None:

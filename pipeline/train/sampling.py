@@ -1,12 +1,14 @@
-"""What every step of a run is made of: a weighted mixture of shuffled sources, cut into parts.
+"""What each step of a run learns from: a weighted mixture of shuffled sources, cut into parts.
 
-All of it is a function of (seed, step).
+Everything is a function of (seed, step), so that a run goes on from any step without stored state.
 """
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import lru_cache
+from math import lcm
+from operator import itemgetter
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,12 +17,12 @@ from pipeline.base.config import TrainHeadParams
 from pipeline.base.errors import ConfigError
 from pipeline.store import FeatureStore
 from pipeline.train.batches import BatchIndices, Lags, Ticks
+from pipeline.train.process_group import ProcessGroup
 from pipeline.train.split import Split, hash64
-from pipeline.train.world import World
 
 
 def ticks_by_source(store: FeatureStore, ticks: Ticks) -> dict[str, Ticks]:
-    """The ticks of each of the store's sources, in the order given; empty where it has none."""
+    """These ticks by source of the store, in their order; empty for a source without any."""
     starts = np.array([episode.ticks.start for episode in store.episodes], np.int64)
     names = np.array([episode.source for episode in store.episodes])
     # Of episodes that start at the same tick, only the last can hold it: the others are empty.
@@ -29,13 +31,14 @@ def ticks_by_source(store: FeatureStore, ticks: Ticks) -> dict[str, Ticks]:
 
 
 class TickSampler:
-    """An endless, resumable mixture of shuffled ticks.
+    """An endless, resumable mixture of shuffled ticks: each batch is a function of (seed, step).
 
     A source's share of the draws is its weight times its number of ticks, over the sum of these:
     weight 1 for all is uniform over ticks, weight 3 shows a tick of that source three times as
-    often; it is kept to one draw at any time for up to three sources (1.5 for eight). Within a
-    source every tick comes once an epoch. Weights that are not named are 1; a source of weight 0
-    or without ticks is left out. Raises `ConfigError` on unknown names or where nothing is left.
+    often. After any number of draws each source is within a draw of its share with up to three
+    sources, within 1.5 with eight. Within a source every tick comes once an epoch. A weight that is
+    not named is 1; a source of weight 0 or without ticks is left out. Raises `ConfigError` on
+    unknown names or where nothing is left.
     """
 
     def __init__(
@@ -51,28 +54,38 @@ class TickSampler:
                 f"train_head.mixture names {', '.join(unknown)}, but the store has only "
                 f"{', '.join(sorted(ticks_by_source)) or 'no source'}"
             )
-        size = {
-            name: Fraction(weights.get(name, 1.0)) * len(ticks)
-            for name, ticks in ticks_by_source.items()
-        }
-        size = {name: mass for name, mass in size.items() if mass > 0}
-        if not size:
+        exact = {name: Fraction(weights.get(name, 1.0)) for name in ticks_by_source}
+        scale = lcm(*(weight.denominator for weight in exact.values()))
+        masses = {name: int(exact[name] * scale) * len(t) for name, t in ticks_by_source.items()}
+        masses = {name: mass for name, mass in masses.items() if mass > 0}
+        if not masses:
             raise ConfigError(
                 "train_head.mixture leaves nothing to train on: expected a source with ticks and "
                 f"a weight above 0, found { {n: len(t) for n, t in ticks_by_source.items()} } "
                 f"ticks under weights {dict(weights)}"
             )
         self.batch_size, self.seed = batch_size, seed
-        self.count_drawn = _mixture(size).count_drawn
-        """How many of the first so many draws each source gave."""
-        self.shares = {name: float(mass / sum(size.values())) for name, mass in size.items()}
-        self._ticks = {name: ticks_by_source[name] for name in size}
-        self._order = lru_cache(2 * len(size))(self._shuffle)
+        self.shares = {name: mass / sum(masses.values()) for name, mass in masses.items()}
+        self._forks = _fork(masses)
+        self._ticks = {name: ticks_by_source[name] for name in masses}
+        self._order = lru_cache(2 * len(masses))(self._shuffle)
 
     def batch(self, step: int) -> Ticks:
-        """The ticks (batch_size,) of this step, source by source: a function of (seed, step)."""
+        """The ticks (batch_size,) of this step, source by source."""
         first, last = (self.count_drawn(n * self.batch_size) for n in (step, step + 1))
         return np.concatenate([self._range(name, first[name], last[name]) for name in self._ticks])
+
+    def count_drawn(self, draws: int) -> dict[str, int]:
+        """How many of the first `draws` draws each source gives.
+
+        At each fork the left takes its rounded share and the right the rest, so that one more draw
+        is one more of exactly one source. Rounding source by source would take draws back.
+        """
+        drawn = {frozenset(self._ticks): draws}
+        for whole, left, right, mass, total in self._forks:
+            drawn[left] = (2 * drawn[whole] * mass + total) // (2 * total)
+            drawn[right] = drawn[whole] - drawn[left]
+        return {name: drawn[frozenset((name,))] for name in self._ticks}
 
     def _range(self, name: str, start: int, stop: int) -> Ticks:
         """The draws [start, stop) of one source, across epochs."""
@@ -91,63 +104,46 @@ class TickSampler:
         return rng.permutation(len(self._ticks[name]))
 
 
-@dataclass(frozen=True)
-class _Node:
-    """A source, or a fork that divides draws between two nodes; mass is weight times ticks."""
-
-    mass: Fraction
-    source: str = ""
-    fork: tuple["_Node", "_Node"] | None = None
-
-    def count_drawn(self, draws: int) -> dict[str, int]:
-        """How many of the first `draws` that come here each source from here on gets.
-
-        The left gets round(draws · share), exactly, the right the rest: of one more draw either
-        gets 0 or 1 more, and so does every source. Rounding source by source and handing out the
-        remainder would take draws back (the Alabama paradox).
-        """
-        if self.fork is None:
-            return {self.source: draws}
-        left, right = self.fork
-        to_left = (2 * draws * left.mass + self.mass) // (2 * self.mass)
-        return left.count_drawn(to_left) | right.count_drawn(draws - to_left)
+Sources = frozenset[str]
 
 
-def _mixture(masses: Mapping[str, Fraction]) -> _Node:
-    """Forks to all sources, the two lightest nodes joined until one is left: a Huffman tree.
+def _fork(masses: Mapping[str, int]) -> list[tuple[Sources, Sources, Sources, int, int]]:
+    """How draws fork from all sources down to each: (whole, left, right, mass of left, of whole).
 
-    Each fork rounds by half a draw. Split off one after the other, eight sources would add that up
-    to more than 1.5 draws; here heavy sources are a fork or two away.
+    The two lightest sets are joined until one is left. So a heavy source is a fork or two away, and
+    few roundings, of half a draw each, add up on the way to it.
     """
-    nodes = [_Node(masses[name], name) for name in sorted(masses)]
-    while len(nodes) > 1:
-        left, right, *others = sorted(nodes, key=lambda node: node.mass)
-        nodes = [_Node(left.mass + right.mass, fork=(left, right)), *others]
-    return nodes[0]
+    sets = [(masses[name], frozenset((name,))) for name in sorted(masses)]
+    forks: list[tuple[Sources, Sources, Sources, int, int]] = []
+    while len(sets) > 1:
+        (mass, left), (other, right), *rest = sorted(sets, key=itemgetter(0))
+        forks.append((left | right, left, right, mass, mass + other))
+        sets = [(mass + other, left | right), *rest]
+    return forks[::-1]
 
 
 _VARIANTS, _LAGS = (0, 1), (0, 2)
-"""After (seed, step), tell the random numbers that pick variants and lags from those of any part:
-numpy takes (seed, step, part) for (seed, step, part, 0), so that a third number would not do."""
+"""Follow (seed, step) in the seeds of variants and lags, so that these differ from the seed of any
+part: numpy reads (seed, step, part) as (seed, step, part, 0), so a third number would not do."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class StepPart(BatchIndices):
-    """A part of a step's batch, computed at once; a feed hands it back beside its batch."""
+    """A part of a step's batch, computed in one pass; a feed hands it back beside its batch."""
 
     share: float
-    """Of the step's valid chunk steps: what the part's mean loss counts in the whole mean."""
+    """Of the step's valid chunk steps: the weight of the part's mean loss in the step's."""
     seed: int
-    """Of its dropout and its sampled noise: a function of (seed, step, part)."""
+    """Of the part's dropout and sampled noise: a function of (seed, step, part)."""
 
 
 class Plan:
     """The ticks of every step, in as many parts as processes times `grad_accumulation`.
 
-    Parts p·a to p·a + a - 1 are those of process p, so that N processes do what one with N times
-    the accumulation does. Everything follows from params and store: nothing is communicated and
-    nothing has to be kept to go on from any step. `section` of the params is the one that errors
-    name. Raises `ConfigError` where parts would be empty.
+    Process p has the parts p·a to p·a + a - 1, so that N processes do what one does with N times
+    the accumulation a. Everything follows from params and store: processes exchange nothing.
+    `section` is the section of the params that errors name. Raises `ConfigError` where a part would
+    be empty.
     """
 
     def __init__(
@@ -155,17 +151,17 @@ class Plan:
         store: FeatureStore,
         params: TrainHeadParams,
         split: Split,
-        world: World,
+        processes: ProcessGroup,
         section: str = "train_head",
     ) -> None:
-        self.parts = world.size * params.grad_accumulation
+        self.parts = processes.size * params.grad_accumulation
         if params.batch_size < self.parts:
             raise ConfigError(
                 f"{section}.batch_size is {params.batch_size}: expected a tick at least for "
-                f"each of the {self.parts} parts of a step ({world.size} process(es) x "
+                f"each of the {self.parts} parts of a step ({processes.size} process(es) x "
                 f"grad_accumulation {params.grad_accumulation}). Raise it, or accumulate less."
             )
-        first = world.rank * params.grad_accumulation
+        first = processes.rank * params.grad_accumulation
         self.own = range(first, first + params.grad_accumulation)
         """The parts of this process."""
         self._sampler = TickSampler(
@@ -189,7 +185,7 @@ class Plan:
         late = np.random.default_rng((seed, step, *_LAGS))
         feature_lag = late.integers(self._params.feature_lag + 1, size=len(ticks))
         sensor_lag_s = late.uniform(0, self._params.sensor_lag_s, len(ticks))
-        # Of each chunk, the steps before its episode's end count; of one that stands still, all.
+        # The steps of a chunk before its episode's end count; with terminal_stop all do.
         counts = np.full(len(ticks), self._params.horizon)
         if not self._params.terminal_stop:
             counts = np.minimum(counts, self._ends[ticks] - ticks)

@@ -18,26 +18,26 @@ Errors = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Cells:
-    """The sets of ticks over which errors are summed up: those of one episode and one phase.
+    """The sets of ticks over which errors are summed: those of one episode and one phase.
 
-    Whatever a figure is about, it is a sum over cells: its episodes, groups of these, or a phase.
+    Every figure is a sum over cells: of episodes, of groups of episodes, or of a phase.
     """
 
     episode: NDArray[np.int64]
     """(cell,) index in the store."""
     group: NDArray[np.str_]
-    """(cell,) the group of recordings that its episode is of: what a bootstrap draws."""
+    """(cell,) the group of its episode, which a bootstrap draws."""
     phase: NDArray[np.str_]
     """(cell,) empty where phases are not known."""
     ticks: NDArray[np.int64]
-    """(cell,) how many."""
+    """(cell,) number of ticks."""
     entries: Errors
     """(cell, horizon) valid chunk entries by steps ahead."""
 
 
 @dataclass(frozen=True, eq=False)
 class ActionErrors:
-    """Errors of one way to act, summed up over the valid chunk entries of each cell.
+    """Errors of one method, summed over the valid chunk entries of each cell.
 
     Means are NaN where no entry is valid. Their last axis is the action dimension.
     """
@@ -75,7 +75,7 @@ def summed(values: NDArray[Any], place: NDArray[np.intp]) -> Errors:
 
 @dataclass(frozen=True)
 class ActionGroup:
-    """Action dimensions that are summed up together: mean of their errors, in their unit."""
+    """Action dimensions whose errors are averaged, in their unit."""
 
     name: str
     unit: str
@@ -97,7 +97,7 @@ ActionSpace = tuple[tuple[str, ...], tuple[str, ...], tuple[ActionGroup, ...], E
 
 @dataclass(frozen=True)
 class Comparison:
-    """A policy, and whatever else is judged beside it, on the same ticks."""
+    """The errors of a policy and of the methods beside it, on the same ticks."""
 
     names: tuple[str, ...]
     units: tuple[str, ...]
@@ -117,22 +117,22 @@ class Comparison:
 
     @property
     def ticks(self) -> int:
-        """How many."""
+        """Number of ticks."""
         return int(self.cells.ticks.sum())
 
     @property
     def executed(self) -> "Comparison":
-        """The same over the steps that are executed."""
+        """The comparison over the steps that are executed."""
         return self.part(steps=slice(self.execute))
 
     def of_phase(self, phase: str) -> "Comparison":
-        """The same on the ticks of one phase."""
+        """The comparison on the ticks of one phase."""
         return self.part(self.cells.phase == phase)
 
     def part(
         self, here: NDArray[np.bool_] | slice = slice(None), steps: slice = slice(None)
     ) -> "Comparison":
-        """The same over some cells and some steps of the chunk."""
+        """The comparison over some cells and some steps of the chunk."""
         cells = Cells(*(values[here] for values in vars(self.cells).values()))
         cells = replace(cells, entries=cells.entries[:, steps])
         scores = {
@@ -142,7 +142,7 @@ class Comparison:
         return replace(self, cells=cells, scores=scores)
 
     def weights(self, group: ActionGroup | None = None) -> Errors:
-        """(action_dim,) what each dimension weighs in the error of a group; of None, overall."""
+        """(action_dim,) the weight of each dimension in the error of a group; of None, overall."""
         dimensions = self.varying() if group is None else list(group.dimensions)
         weights = np.zeros(len(self.names))
         weights[dimensions] = 1 / len(dimensions)
@@ -155,9 +155,9 @@ class Comparison:
     def overall(self, method: str) -> float:
         """Mean absolute error in units of the training standard deviation.
 
-        The mean over the dimensions that vary, each divided by its own standard deviation; of
-        normally distributed actions, always acting the mean then costs 0.8. Where none varies, all
-        count, undivided.
+        The mean over the dimensions that vary, each divided by its standard deviation; on normally
+        distributed actions, the mean action has an error of 0.8. Where none varies, all count,
+        undivided.
         """
         return self.error(method)
 
@@ -166,16 +166,16 @@ class Comparison:
         return self.in_training_std(self.scores[method].mae_episode).mean(axis=-1)
 
     def ranked(self) -> list[int]:
-        """Places in `episodes`, from the one that the policy follows best to the one it does worst.
+        """Places in `episodes`, from the lowest `overall_by_episode` of the policy to the highest.
 
-        By `overall_by_episode`; of equals, the first comes first.
+        Equal ones keep their order.
         """
         return np.argsort(self.overall_by_episode("policy"), kind="stable").tolist()
 
     def extremes(self) -> list[tuple[str, int]]:
-        """The episodes of lowest and highest error: what to call each, and its store index.
+        """The episodes of lowest and highest error, each with its name and store index.
 
-        Only one where there is no other.
+        A single entry where there is one episode.
         """
         order = self.ranked()
         best, worst = order[0], order[-1]
@@ -194,22 +194,22 @@ class Comparison:
         return [group for group in self.groups if varying & set(group.dimensions)]
 
     def low_variance(self) -> dict[int, float]:
-        """The dimensions that vary, but hardly: in `overall`, noise that counts like a motion.
+        """The dimensions that hardly vary, so that their noise counts like a motion in `overall`.
 
-        Each with the usual training deviation of those alike, by name and unit or, as of joints
-        that are called after limbs, by unit alone.
+        Each with the usual training deviation of similar dimensions: of similar names and equal
+        unit, or (joints named after limbs) of equal unit.
         """
         by_unit = hardly_moving(self.scale, [""] * len(self.names), self.units)
         return by_unit | hardly_moving(self.scale, self.names, self.units)
 
     def without_low_variance(self) -> "Comparison":
-        """The same, in which what is `low_variance` counts as not varying: it weighs nothing."""
+        """The comparison in which `low_variance` dimensions have no weight."""
         scale = self.scale.copy()
         scale[list(self.low_variance())] = 0
         return replace(self, scale=scale)
 
     def in_training_std(self, errors: Errors) -> Errors:
-        """Errors (..., action_dim) of the `varying` dimensions, by their training deviations."""
+        """Errors (..., action_dim) of the `varying` dimensions, over their training deviations."""
         dimensions = self.varying()
         return errors[..., dimensions] / np.where(self.scale > 0, self.scale, 1)[dimensions]
 
@@ -222,9 +222,7 @@ def action_space(store: FeatureStore, normalization: Normalization) -> ActionSpa
     for index, group in enumerate(action_groups(names, units)):
         members.setdefault((group, units[index]), []).append(index)
     groups = tuple(ActionGroup(*key, tuple(dimensions)) for key, dimensions in members.items())
-    # A channel that does not vary has a scale of 1 that is not its spread.
-    scale = np.where(statistics.scale == statistics.std, statistics.std, 0.0)
-    return names, units, groups, scale
+    return names, units, groups, statistics.spread
 
 
 def compare(
@@ -235,10 +233,10 @@ def compare(
     phase: NDArray[np.str_] | None = None,
     execute: int = 1,
 ) -> Comparison:
-    """The errors of the policy and of what `others` did, (tick, horizon or 1, action_dim).
+    """The errors of the policy and of the actions of `others`, (tick, horizon or 1, action_dim).
 
-    `space` is what `action_space` gives. `group` and `phase` are (tick,): those of each tick.
-    Without, each episode is a group, and phases are not known.
+    `space` is that of `action_space`. `group` and `phase` (tick,) are those of each tick; without
+    them each episode is a group, and phases are not known.
     """
     episodes = predictions.episodes
     labels = [

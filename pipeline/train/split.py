@@ -1,34 +1,39 @@
 """Which ticks are trained on, which choose the checkpoint and which are reported.
 
-And the sides of a checkpoint found again in a store.
+Whole groups of episodes fall on one side, in five steps:
+
+1. `episodes_by_group` finds the episodes that must stay together.
+2. `_ranks`: a hash of the seed and the group's name gives each group a number in [0, 1).
+3. `_test_groups`: with folds, or with two groups, some groups are test whatever their rank.
+4. `_sides_by_rank`: every other group takes the side whose range holds its rank.
+5. `_fill_empty_sides`: where few groups leave a side empty, the group of the nearest rank moves in.
+
+Where one group is left after step 3, it is cut by time instead (`_cut_by_time`).
 """
 
 import hashlib
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
-from itertools import chain, pairwise
-from typing import Any
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.base.commands import command
 from pipeline.base.config import SplitParams
-from pipeline.base.differences import describe, differences
-from pipeline.base.errors import CheckpointMismatch, ConfigError, StoreMismatch
-from pipeline.base.tuned_on import SIDES, EpisodePart, Side
-from pipeline.policy.checkpoint import SOURCE_KEYS, PolicyCheckpoint
+from pipeline.base.errors import ConfigError, StoreMismatch
+from pipeline.base.tuned_on import SIDES, Side
 from pipeline.store import Episode, FeatureStore, episode_name
 from pipeline.train.groups import episodes_by_group
 
 _SHOWN = 5
-"""Groups that a note lists as moved."""
+"""Moved groups that a note lists."""
 
 _SLACK_S = 1e-6
-"""Two times that differ by less are one: seconds since 1970 in float64 are this coarse."""
+"""Times that differ by less are equal: float64 seconds since 1970 are this coarse."""
 
 Groups = Mapping[str, Sequence[Episode]]
-Bounds = Mapping[Side, tuple[float, float]]
+Ranges = Mapping[Side, tuple[float, float]]
+"""The ranks [low, high) of each side."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,7 +46,7 @@ class Split:
     groups: Mapping[str, str]
     """"source/id" of each episode that has ticks -> its group."""
     note: str | None
-    """What the reader of a metric has to know about this split, or None."""
+    """What a reader of the metrics must know about this split, or None."""
 
 
 def split_by_episode(
@@ -50,23 +55,20 @@ def split_by_episode(
     horizon: int = 8,
     keys: NDArray[np.uint8] | None = None,
 ) -> Split:
-    """Whole groups of episodes on each side, by a hash of `params.seed` and the group's name.
+    """The split of the store's episodes into whole groups, drawn as the module's docstring says.
 
-    So an added episode moves none but those of its own group, save where a side would be empty: a
-    source of three or more groups has one on each side that is asked for, one of two has one to
-    train on, and all sources together have one on each side. `folds` deals the groups of each
-    source in the order of their hashes, so that each is in test in one fold; `val` is drawn from
-    the others. `train` leaves out all groups to train on but so many, the first by their hashes,
-    which may leave a source with none.
+    An added episode moves only its own group, unless a side was empty before or would be after.
+    Every side with a share above 0 has a group of each source of three or more groups, and of the
+    whole store; a source of two groups has one to train on. With `folds`, each group is test in
+    one fold, and `val` is drawn from the others. `params.train` keeps that many training groups,
+    those of the lowest ranks.
 
-    Of two groups one is test, and val is cut from the tail of the other. A single one is cut by
-    time into all three, at one instant for all of its episodes: those are then one recording in
-    several formats. Ticks whose chunk of `horizon` actions reaches into the next side belong to
-    none.
+    Of two groups one is test, and the tail of the other is val. A single group is cut by time into
+    all three sides. Ticks whose chunk of `horizon` actions reaches into the next side are left out.
 
-    Raises `ConfigError` where that leaves nothing to train on, or there are fewer groups than
-    folds, and `StoreMismatch` where the store has no tick. `keys` (vl_row, 16) stand in for the VL
-    keys of a store that has none.
+    `keys` (vl_row, 16) replace the VL keys of a store that has none. Raises `StoreMismatch` where
+    the store has no tick, and `ConfigError` where no training tick is left or there are fewer
+    groups than folds.
     """
     groups = episodes_by_group(store, params.groups, keys)
     if not groups:
@@ -75,49 +77,51 @@ def split_by_episode(
             "stages.extract again."
         )
     shares: dict[Side, float] = {"test": params.test, "val": params.val}
-    asked: dict[Side, float] = {side: share for side, share in shares.items() if share > 0}
+    shares = {side: share for side, share in shares.items() if share > 0}
     ranks = _ranks(groups, f"{params.seed}")
-    test = _fold(groups, ranks, params)
-    if not test and len(groups) == len(asked) == 2:
-        test = {min(groups, key=lambda name: ranks[name])}
+    test = _test_groups(groups, ranks, params, shares)
     if test:
-        asked.pop("test", None)
+        shares.pop("test", None)
     rest = {name: group for name, group in groups.items() if name not in test}
     if len(rest) == 1:
-        sides, notes = _cut_by_time(store, next(iter(rest.values())), asked, horizon)
+        (group,) = rest.values()
+        ticks, notes = _cut_by_time(store, group, shares, horizon)
         notes = [f"of {len(groups)} groups {len(test)} is test", *notes] if test else notes
     else:
-        ranks = ranks if params.folds is None else _ranks(rest, f"{params.seed}.{params.fold}")
-        bounds = _bounds(asked, of=len(rest) / len(groups))
-        side_of: dict[str, Side] = {
-            name: next(side for side, (_, high) in bounds.items() if ranks[name] < high)
-            for name in rest
-        }
-        notes = _repair(side_of, ranks, bounds, _quotas(groups, rest.keys(), tuple(bounds)))
-        trained = sorted((n for n in rest if side_of[n] == "train"), key=lambda n: ranks[n])
-        for name in trained[params.train :] if params.train is not None else ():
-            del side_of[name]
-        sides = {
-            side: _ticks([e for name in rest if side_of.get(name) == side for e in rest[name]])
-            for side in bounds
+        if params.folds is not None:
+            ranks = _ranks(rest, f"{params.seed}.{params.fold}")
+        ranges = _ranges(shares, len(rest) / len(groups))
+        side_of = _sides_by_rank(rest, ranks, ranges)
+        notes = _fill_empty_sides(side_of, ranks, ranges, _needs(groups, rest, tuple(ranges)))
+        members = {side: [n for n in side_of if side_of[n] == side] for side in ranges}
+        members["train"] = sorted(members["train"], key=ranks.__getitem__)[: params.train]
+        ticks = {
+            side: ticks_of([e for n in names for e in rest[n]]) for side, names in members.items()
         }
     if test:
-        sides["test"] = _ticks([e for name in test for e in groups[name]])
+        ticks["test"] = ticks_of([e for name in test for e in groups[name]])
     return Split(
-        *(sides.get(side, _ticks([])) for side in SIDES),
+        *(ticks.get(side, ticks_of([])) for side in SIDES),
         groups={episode_name(e): name for name, group in groups.items() for e in group},
         note="; ".join(notes) or None,
     )
 
 
 def _ranks(names: Iterable[str], seed: str) -> dict[str, float]:
+    """A number in [0, 1) for each group, which depends on the seed and the name alone."""
     return {name: hash64(f"{seed} {name}") / 2**64 for name in names}
 
 
-def _fold(groups: Groups, ranks: Mapping[str, float], params: SplitParams) -> set[str]:
-    """The groups that are test in this fold: those of each source are dealt in turn."""
+def _test_groups(
+    groups: Groups, ranks: Mapping[str, float], params: SplitParams, shares: Mapping[Side, float]
+) -> set[str]:
+    """The groups that are test whatever their rank; empty where the ranks decide.
+
+    With folds, the groups of each source are dealt to the folds in the order of their ranks. Of
+    two groups, where both val and test are asked for, the one of lower rank is test.
+    """
     if params.folds is None:
-        return set()
+        return {min(groups, key=ranks.__getitem__)} if len(groups) == len(shares) == 2 else set()
     if params.folds > len(groups):
         raise ConfigError(
             f"train_head.split.folds is {params.folds}, but the store has {len(groups)} group(s) "
@@ -128,89 +132,106 @@ def _fold(groups: Groups, ranks: Mapping[str, float], params: SplitParams) -> se
     return set(dealt[params.fold :: params.folds])
 
 
-def _bounds(shares: Mapping[Side, float], of: float) -> Bounds:
-    """Between which ranks a group is on which side, shares being of `of` times all groups."""
+def _ranges(shares: Mapping[Side, float], drawn: float) -> Ranges:
+    """The ranks of each side, train last; `shares` are of all groups, of which `drawn` are here."""
     sides: tuple[Side, ...] = (*shares, "train")
-    edges = np.minimum(np.cumsum([0.0, *shares.values()]) / of, 1.0).tolist()
+    edges = np.minimum(np.cumsum([0.0, *shares.values()]) / drawn, 1.0).tolist()
     return dict(zip(sides, pairwise((*edges, 1.0)), strict=True))
 
 
+def _sides_by_rank(
+    names: Iterable[str], ranks: Mapping[str, float], ranges: Ranges
+) -> dict[str, Side]:
+    return {
+        name: next(side for side, (_, high) in ranges.items() if ranks[name] < high)
+        for name in names
+    }
+
+
 @dataclass(frozen=True)
-class _Quota:
-    """Sides on each of which there has to be one of these groups."""
+class _Need:
+    """Each of these sides needs one of these groups."""
 
     of: str
     groups: frozenset[str]
     sides: tuple[Side, ...]
     weight: int
-    """Of a side that is missing, where not all quotas can be met."""
+    """How much an empty side counts."""
 
-    def missing(self, side_of: Mapping[str, Side]) -> set[Side]:
-        """The sides that have none of these groups."""
+    def empty_sides(self, side_of: Mapping[str, Side]) -> set[Side]:
+        """The sides without any of the groups."""
         return set(self.sides) - {side_of[name] for name in self.groups}
 
 
-def _quotas(groups: Groups, drawn: Collection[str], sides: tuple[Side, ...]) -> Iterator[_Quota]:
-    """What of the groups drawn has to be on which side: of each source, then of all together."""
-    sources = sorted({episode.source for episode in chain(*groups.values())})
-    for source in sources:
-        own = {name for name, group in groups.items() if any(e.source == source for e in group)}
-        rest = frozenset(own.intersection(drawn))
-        if len(own) > 2 and len(rest) >= len(sides):
-            yield _Quota(f"source {source!r}", rest, sides, 1)
-        elif len(own) > 1 and rest:
-            yield _Quota(f"source {source!r}", rest, ("train",), 1)
-    yield _Quota("all sources", frozenset(drawn), sides, 3 * len(sources))
+def _needs(groups: Groups, drawn: Collection[str], sides: tuple[Side, ...]) -> list[_Need]:
+    """A need of each source, by name, then that of the store, which outweighs all sources.
+
+    A source of three or more groups needs each side, as far as its groups suffice after folds; a
+    source of two needs one to train on; a source of one needs nothing.
+    """
+    by_source: dict[str, set[str]] = {}
+    for name, group in groups.items():
+        for episode in group:
+            by_source.setdefault(episode.source, set()).add(name)
+    needs: list[_Need] = []
+    for source, own in sorted(by_source.items()):
+        here = frozenset(own.intersection(drawn))
+        every_side = len(own) > 2 and len(here) >= len(sides)
+        if here and len(own) > 1:
+            needed: tuple[Side, ...] = sides if every_side else ("train",)
+            needs.append(_Need(f"source {source!r}", here, needed, 1))
+    return [*needs, _Need("all sources", frozenset(drawn), sides, 3 * len(by_source))]
 
 
-def _repair(
-    side_of: dict[str, Side], ranks: Mapping[str, float], bounds: Bounds, quotas: Iterable[_Quota]
+def _fill_empty_sides(
+    side_of: dict[str, Side], ranks: Mapping[str, float], ranges: Ranges, needs: Sequence[_Need]
 ) -> list[str]:
-    """Move a group to each side that has none of a quota; returns what was moved.
+    """Move a group to each empty side of a need, in place; returns what was moved.
 
-    The one that leaves the least missing to this quota and those before it, of these the one whose
-    rank is nearest; none where no move leaves less.
+    Need by need, the group moves that leaves the fewest empty sides to this need and to those
+    before it; of several, the one whose rank is nearest to the side's. None moves where every move
+    would empty as much as it fills.
     """
     notes: list[str] = []
-    before: list[_Quota] = []
-    for quota in quotas:
-        before.append(quota)
-        for side in sorted(quota.missing(side_of)):
-            low, high = bounds[side]
+    for number, need in enumerate(needs, 1):
+        met = needs[:number]
+        for side in sorted(need.empty_sides(side_of)):
+            low, high = ranges[side]
             change, _, name = min(
-                (_change(side_of, n, side, before), max(low - ranks[n], ranks[n] - high), n)
-                for n in quota.groups
+                (_change(side_of, n, side, met), max(low - ranks[n], ranks[n] - high), n)
+                for n in need.groups
             )
             if change < 0:
                 side_of[name] = side
-                notes.append(f"{side} had nothing of {quota.of}, {name} was moved there")
+                notes.append(f"{side} had nothing of {need.of}, {name} was moved there")
     more = [f"and {len(notes) - _SHOWN} more"] if len(notes) > _SHOWN else []
     return [*notes[:_SHOWN], *more]
 
 
-def _change(side_of: Mapping[str, Side], name: str, side: Side, quotas: Iterable[_Quota]) -> int:
-    """The weight of what the quotas miss with this group on that side, less what they miss now."""
+def _change(side_of: Mapping[str, Side], name: str, side: Side, needs: Iterable[_Need]) -> int:
+    """The weight of the sides that a move of this group empties, less that of those it fills."""
+    own = [need for need in needs if name in need.groups]
     moved: dict[str, Side] = {**side_of, name: side}
     return sum(
-        q.weight * (len(q.missing(moved)) - len(q.missing(side_of)))
-        for q in quotas
-        if name in q.groups
+        need.weight * (len(need.empty_sides(moved)) - len(need.empty_sides(side_of)))
+        for need in own
     )
 
 
 def _cut_by_time(
     store: FeatureStore, episodes: Sequence[Episode], shares: Mapping[Side, float], horizon: int
 ) -> tuple[dict[Side, NDArray[np.int64]], list[str]]:
-    """The sides of a single group, from its end: `shares` of its ticks, and what is before them.
+    """The sides of a single group, and what to note: test is its end, then val, then train.
 
-    A side begins at the earliest instant at which its share of an episode's ticks begins.
+    All episodes are cut at the same instants, for they are one recording in several formats. A
+    side begins at the earliest instant at which the last `share` of an episode's ticks begins.
     """
     if not shares:
-        return {"train": _ticks(episodes)}, []
+        return {"train": ticks_of(episodes)}, []
     named = f"a single group ({', '.join(sorted(map(episode_name, episodes)))})"
     clocks = [_elapsed(store, episode) for episode in episodes]
     steps = np.concatenate([np.diff(clock) for clock in clocks])
-    usual = float(np.median(steps)) if len(steps) else 0.0
+    usual_step = float(np.median(steps)) if len(steps) else 0.0
     stops = [len(clock) for clock in clocks]
     sides: dict[Side, NDArray[np.int64]] = {}
     notes: list[str] = []
@@ -219,19 +240,18 @@ def _cut_by_time(
         if not any(counts):
             notes.append(f"{named}, too short to hold ticks out as {side}")
             continue
-        starts = [
-            clock[stop - n]
-            for clock, stop, n in zip(clocks, stops, counts, strict=True)
-            if 0 < n <= stop
+        begins = [
+            clock[stop - count]
+            for clock, stop, count in zip(clocks, stops, counts, strict=True)
+            if 0 < count <= stop
         ]
-        cut = min(starts, default=-np.inf)
-        edges = [_around(clock, cut, horizon, usual) for clock in clocks]
-        sides[side] = _ticks(
-            episodes, [(first, stop) for (_, first), stop in zip(edges, stops, strict=True)]
-        )
-        stops = [min(stop, done) for (done, _), stop in zip(edges, stops, strict=True)]
+        cut = min(begins, default=-np.inf)
+        firsts = [int(np.searchsorted(clock, cut - _SLACK_S)) for clock in clocks]
+        sides[side] = ticks_of(episodes, list(zip(firsts, stops, strict=True)))
+        before = [_ticks_before(clock, cut, horizon, usual_step) for clock in clocks]
+        stops = np.minimum(stops, before).tolist()
         notes.append(f"{named}: {share:.0%} of its ticks, cut from its end, are {side}")
-    sides["train"] = _ticks(episodes, [(0, stop) for stop in stops])
+    sides["train"] = ticks_of(episodes, [(0, stop) for stop in stops])
     if not len(sides["train"]):
         raise ConfigError(
             f"{named} of {', '.join(str(len(clock)) for clock in clocks)} ticks, of which the last "
@@ -246,9 +266,9 @@ def _cut_by_time(
 
 
 def _elapsed(store: FeatureStore, episode: Episode) -> NDArray[np.float64]:
-    """The times (tick,) in s since the newest frame of the first VL row: one for all formats.
+    """(tick,) seconds since the newest frame of the first VL row, or without one the first tick.
 
-    Their clocks may differ and their ticks begin apart. Without a view, since the first tick.
+    So formats whose clocks differ and whose ticks begin apart share one clock.
     """
     time = store.array("tick/time")[episode.ticks.start : episode.ticks.stop]
     frames = store.array("vl/frame_time")[episode.vl_rows.start]
@@ -256,12 +276,10 @@ def _elapsed(store: FeatureStore, episode: Episode) -> NDArray[np.float64]:
     return time - (taken.max() if len(taken) else time[0])
 
 
-def _around(
-    clock: NDArray[np.float64], cut: float, horizon: int, usual_step: float
-) -> tuple[int, int]:
-    """How many leading ticks have chunks that end before the cut, and the first tick at it.
+def _ticks_before(clock: NDArray[np.float64], cut: float, horizon: int, usual_step: float) -> int:
+    """How many leading ticks have chunks that end before the cut.
 
-    A clock's last action lasts its median step, and `usual_step` where it has but one tick.
+    The last action lasts the clock's median step, or `usual_step` where there is only one tick.
     """
     first = int(np.searchsorted(clock, cut - _SLACK_S))
     last_step = np.median(np.diff(clock)) if len(clock) > 1 else usual_step
@@ -269,13 +287,13 @@ def _around(
     # Where ticks of two formats alternate, the action of the tick before the cut lasts beyond it.
     done = first - 1 if first and ends[first - 1] > cut + _SLACK_S else first
     # Chunks do not reach beyond the episode's end.
-    return (done if done == len(clock) else max(0, done - (horizon - 1))), first
+    return done if done == len(clock) else max(0, done - (horizon - 1))
 
 
-def _ticks(
+def ticks_of(
     episodes: Sequence[Episode], parts: Sequence[tuple[int, int]] | None = None
 ) -> NDArray[np.int64]:
-    """The ticks of these episodes, or [first, stop) of each, counted in the episode; ascending."""
+    """The ticks of these episodes, ascending; with `parts`, only [first, stop) of each."""
     parts = [(0, len(episode.ticks)) for episode in episodes] if parts is None else parts
     own = [
         np.array(e.ticks[slice(*part)], np.int64) for e, part in zip(episodes, parts, strict=True)
@@ -286,102 +304,3 @@ def _ticks(
 def hash64(text: str) -> int:
     """A 64-bit hash, the same in every process."""
     return int.from_bytes(hashlib.blake2b(text.encode(), digest_size=8).digest(), "big")
-
-
-def source_of(store: FeatureStore) -> dict[str, Any]:
-    """What a checkpoint remembers of its store, and what another store must agree with."""
-    return {key: getattr(store, "spec" if key == "feature_spec" else key) for key in SOURCE_KEYS}
-
-
-def list_differences(expected: Any, actual: Any) -> str:
-    """Where two documents differ, on an indented line each; empty where nowhere."""
-    return "\n".join(f"  {line}" for line in describe(differences(expected, actual)))
-
-
-def check_store(checkpoint: PolicyCheckpoint, store: FeatureStore) -> None:
-    """Raise `CheckpointMismatch`, naming what differs, when the policy does not fit this store."""
-    if differing := list_differences(checkpoint.source, source_of(store)):
-        raise CheckpointMismatch(
-            f"the checkpoint does not fit {store.path} (the checkpoint -> the store):\n"
-            f"{differing}\nName the store it was trained from in evaluate.store, extract with the "
-            f"params it was trained with, or train again: {command('train_head')}"
-        )
-
-
-def split_parts(store: FeatureStore, split: Split) -> dict[Side, dict[str, EpisodePart]]:
-    """What a checkpoint says of each side: its episodes by "source/id".
-
-    In a way that outlives episodes that are added before these.
-    """
-    return {side: _parts(store, getattr(split, side), split.groups) for side in SIDES}
-
-
-def _parts(
-    store: FeatureStore, ticks: NDArray[np.int64], groups: Mapping[str, str]
-) -> dict[str, EpisodePart]:
-    edges = np.searchsorted(ticks, store.array("episode/tick_start"))
-    parts = {}
-    for index in np.flatnonzero(np.diff(edges)):
-        episode, inside = store.episodes[index], ticks[edges[index] : edges[index + 1]]
-        name, start = episode_name(episode), episode.ticks.start
-        first, stop = int(inside[0]) - start, int(inside[-1]) + 1 - start
-        assert len(inside) == stop - first, "ticks of an episode on one side lie side by side"
-        parts[name] = EpisodePart(ticks=(first, stop), content=episode.content, group=groups[name])
-    return parts
-
-
-def find_ticks(
-    store: FeatureStore, checkpoint: PolicyCheckpoint, side: Side
-) -> tuple[NDArray[np.int64], PolicyCheckpoint]:
-    """The store's ticks of a side, ascending, and the checkpoint with the store's names of them.
-
-    An episode whose source or folder was renamed since is told by the digest of its files. Raises
-    `CheckpointMismatch` where the side has no episode, or where the store lacks one, has a shorter
-    one of that name, or one made from other files.
-    """
-    parts = checkpoint.split[side]
-    if not parts:
-        raise CheckpointMismatch(
-            f"the checkpoint lists no {side} episode, so there is nothing to look at: it was "
-            f"trained with train_head.split.{side} 0, or on too short a recording. Train again "
-            f"with train_head.split.{side} above 0."
-        )
-    by_name = {episode_name(episode): episode for episode in store.episodes}
-    renamed: dict[str, list[Episode]] = {}
-    for name, episode in by_name.items():
-        if name not in parts or parts[name].content != episode.content:
-            renamed.setdefault(episode.content, []).append(episode)
-    there: list[tuple[Episode, EpisodePart]] = []
-    wrong: list[str] = []
-    for name, part in parts.items():
-        episode = by_name.get(name)
-        same = episode is not None and episode.content == part.content
-        if not same and (elsewhere := renamed.get(part.content)):
-            episode = elsewhere.pop()
-        if episode is None or episode.content != part.content or len(episode.ticks) < part.ticks[1]:
-            wrong.append(name)
-        else:
-            there.append((episode, part))
-    if wrong:
-        raise CheckpointMismatch(
-            f"{store.path}: of the {len(parts)} {side} episodes of the checkpoint, {len(wrong)} "
-            f"are missing, shorter, or other recordings than they were: {', '.join(wrong[:5])}"
-            f"{' …' if len(wrong) > 5 else ''}. Name the store it was trained from in "
-            "evaluate.store, or train again."
-        )
-    named = {episode_name(episode): part for episode, part in there}
-    return (
-        _ticks([episode for episode, _ in there], [part.ticks for _, part in there]),
-        replace(checkpoint, split={**checkpoint.split, side: named}),
-    )
-
-
-def groups_of(
-    store: FeatureStore, checkpoint: PolicyCheckpoint, ticks: NDArray[np.int64]
-) -> NDArray[np.str_]:
-    """(tick,) the group of the episode of each of these ticks, which `find_ticks` gave."""
-    parts = chain.from_iterable(side.values() for side in checkpoint.split.values())
-    # By content: a renamed episode keeps its group, and episodes of equal content share one.
-    group_of = {part.content: part.group for part in parts}
-    indices, place = np.unique(store.episode_of(ticks), return_inverse=True)
-    return np.array([group_of[store.episodes[index].content] for index in indices], str)[place]

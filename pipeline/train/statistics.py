@@ -1,6 +1,7 @@
-"""The normalisation, fitted on what training may see and nothing else."""
+"""The normalisation, fitted on the training ticks alone."""
 
-from collections.abc import Sequence
+from collections.abc import Generator, Iterable, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, replace
 from functools import partial
 from itertools import chain
@@ -23,7 +24,7 @@ from pipeline.train.batches import Ticks, Windows, evenly
 
 CHUNK_BYTES = 64 * 2**20
 _STATE_TICKS = 16_384
-"""Training ticks at most whose windows of states give the statistics of these."""
+"""Training ticks at most whose windows give the statistics of the states."""
 _AT_ONCE = 1024
 Rows = range | NDArray[np.int64]
 """Rows of one of the store's arrays."""
@@ -32,21 +33,25 @@ Rows = range | NDArray[np.int64]
 _ARRAYS = {"tick": "tick/action", "vl": "vl/features"} | {
     stream: f"{stream}/values" for stream in ("sensor", "state")
 }
+_NAMES = {"tick": "training actions", "vl": "training features"} | {
+    stream: f"training readings of {stream}" for stream in ("sensor", "state")
+}
+"""The names of the arrays' rows in errors."""
 
 
 def fit_normalization(
     store: FeatureStore, ticks: Ticks, windows: Windows, threads: int | None = None
 ) -> Normalization:
-    """Statistics per channel over the training `ticks` and what was known at them.
+    """Statistics per channel over the training `ticks` and the readings before them.
 
-    Features over the VL rows that these ticks use, each once, and over all its variants alike, so
-    (slot, dim) of one variant; sensor over the readings from each episode's start to the last of
-    its ticks; states as a policy takes them (`state_channels.expand`), over the windows of at most
-    16,384 evenly spaced ticks; a stream that none of them has, has none. No spread of an input is
-    far below what is usual for inputs alike (`ChannelStatistics.floored`). Reads the store once, in
-    chunks of about 64 MB, a few at a time on `threads` threads (as many as torch has, where None),
-    with a bar on a terminal; the same bits for any number of them. Raises `NumericsError` on NaN or
-    inf, naming episode, tick or reading, time and channel.
+    Features: over the VL rows that these ticks use, each once, with all variants alike, so (slot,
+    dim). Sensor: over the readings from each episode's start to its last tick. States: as a policy
+    takes them (`state_channels.expand`), over the windows of at most 16,384 evenly spaced ticks. A
+    stream that no tick has gets no statistics. No spread is far below what is usual for similar
+    inputs (`ChannelStatistics.floored`). Reads the store once, in chunks of about 64 MB, a few at a
+    time on `threads` threads (None: as many as torch has), with a bar on a terminal. The bits do
+    not depend on the number of threads. Raises `NumericsError` on NaN or inf, naming episode, tick
+    or reading, time and channel.
     """
     threads = torch.get_num_threads() if threads is None else threads
     parts: dict[str, list[Rows]] = {
@@ -85,16 +90,11 @@ def _fit_state(store: FeatureStore, ticks: Ticks, windows: Windows) -> ChannelSt
         return expand(batch.state, kinds)[real].numpy()
 
     parts = np.array_split(some, -(-len(some) // _AT_ONCE))
-    what = "training readings of state"
     blocks = (block for part in parts if len(block := read(part)))
     if (first := next(blocks, None)) is None:
         return None  # all readings are older than the window
-    try:
-        fitted = fit_channels(chain([first], blocks), what)
-    except NumericsError:
-        for rows in readings:
-            check_finite(store, "state", rows, what, *_read(store, "state", rows))
-        raise
+    with _place_named(store, "state", readings):
+        fitted = fit_channels(chain([first], blocks), _NAMES["state"])
     names = expanded_names(channels["names"], kinds)
     return _floored(fitted, names, [""] * len(names))
 
@@ -106,28 +106,31 @@ def _channels(store: FeatureStore, stream: str) -> dict[str, list[str]]:
 def _floored(
     fitted: ChannelStatistics, names: Sequence[str], units: Sequence[str]
 ) -> ChannelStatistics:
-    varying = np.where(fitted.scale == fitted.std, fitted.std, 0.0)
-    return fitted.floored(usual_spread(varying, names, units))
+    return fitted.floored(usual_spread(fitted.spread, names, units))
 
 
 def _fit(
     store: FeatureStore, stream: str, parts: list[Rows], bar: "tqdm[NoReturn]", threads: int
 ) -> ChannelStatistics:
-    what = {"tick": "training actions", "vl": "training features"}.get(
-        stream, f"training readings of {stream}"
-    )
 
     def read(rows: Rows) -> Block:
         values, valid = _read(store, stream, rows)
         bar.update(len(rows))
         return values if valid is None else (values, valid)
 
+    readings = [partial(read, rows) for rows in parts]
+    with _place_named(store, stream, parts):
+        return fit_channels(readings, _NAMES[stream], threads=threads)
+
+
+@contextmanager
+def _place_named(store: FeatureStore, stream: str, parts: Iterable[Rows]) -> Generator[None]:
+    """Within it, a `NumericsError` names the place in the recordings, not the row of a block."""
     try:
-        return fit_channels([partial(read, rows) for rows in parts], what, threads=threads)
+        yield
     except NumericsError:
-        # It knows the row of what it was given, which says nothing to who made the recordings.
         for rows in parts:
-            check_finite(store, stream, rows, what, *_read(store, stream, rows))
+            check_finite(store, stream, rows, _NAMES[stream], *_read(store, stream, rows))
         raise
 
 
@@ -139,8 +142,10 @@ def check_finite(
     values: NDArray[Any],
     valid: NDArray[np.bool_] | None = None,
 ) -> None:
-    """Raise `NumericsError`, naming the place, where one of the valid `values` of these rows of a
-    stream is no number; a row of `vl` stands there once for each variant."""
+    """Raise `NumericsError`, naming the place, where a valid value of these rows is not finite.
+
+    `values` has a row for each of `rows`; of `vl` one for each variant.
+    """
     bad = first_non_finite(values, valid)
     if bad is None:
         return
@@ -174,7 +179,7 @@ def _cut(store: FeatureStore, stream: str, rows: NDArray[np.int64]) -> list[Rows
 def _read(
     store: FeatureStore, stream: str, rows: Rows
 ) -> tuple[NDArray[Any], NDArray[np.bool_] | None]:
-    """The values, of features (row of one variant, slot, dim) with which slots are valid."""
+    """The values; of features (row of one variant, slot, dim), and which slots are valid."""
     array = store.array(_ARRAYS[stream])
     values = widen(array[rows.start : rows.stop] if isinstance(rows, range) else array[rows])
     if stream != "vl":

@@ -29,7 +29,7 @@ from pipeline.compat.unified import (
     no_normalization,
 )
 from pipeline.policy.checkpoint import PolicyCheckpoint
-from pipeline.policy.guidance import Guide
+from pipeline.policy.expert import Guide
 from pipeline.policy.observation import LiveObservation, PolicyShape
 from pipeline.policy.policy import Policy, Trainable
 from pipeline.vlm.feature_spec import feature_spec

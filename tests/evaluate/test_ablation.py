@@ -30,7 +30,8 @@ from pipeline.store import FeatureStore
 from pipeline.train.batches import BatchIndices, Lags, Windows
 from pipeline.train.predictions import Predictions
 from pipeline.train.run import policy_shape
-from pipeline.train.split import source_of, split_by_episode, split_parts
+from pipeline.train.split import split_by_episode
+from pipeline.train.training_data import source_of, split_parts
 
 PARAMS = {
     "sensor_encoder": {"channels": [16], "layers": 0, "heads": 1, "output_dim": 16},

@@ -10,7 +10,8 @@ import torch
 from pipeline.base.config import RolloutParams, TrainHeadParams
 from pipeline.base.errors import CheckpointMismatch, ConfigError
 from pipeline.compat.unified import no_normalization
-from pipeline.evaluate.rollouts import Rollouts, SuccessRate, roll_out
+from pipeline.evaluate.rollout_driver import roll_out
+from pipeline.evaluate.rollouts import Rollouts, SuccessRate
 from pipeline.policy.checkpoint import PolicyCheckpoint
 from pipeline.policy.observation import PolicyShape, stream_of
 from pipeline.policy.policy import Policy
@@ -373,7 +374,7 @@ def test_the_model_proves_itself_before_the_first_episode(monkeypatch: pytest.Mo
         assert (checkpoint, features) == (parts[0], parts[2])
         raise CheckpointMismatch("golden rows are not the features")
 
-    monkeypatch.setattr("pipeline.evaluate.rollouts.prove", refuse)
+    monkeypatch.setattr("pipeline.evaluate.rollout_driver.prove", refuse)
     with pytest.raises(CheckpointMismatch, match="golden rows"):
         rolled(parts)
     assert not parts[2].passes

@@ -25,7 +25,7 @@ from pipeline.extract.survey import check_episodes, sound_episodes, survey
 from pipeline.policy import checkpoint as checkpoints
 from pipeline.store import FeatureStore
 from pipeline.store.verification import verify
-from pipeline.train.split import check_store
+from pipeline.train.training_data import check_store
 from tests.fuzz import plain
 from tests.fuzz.corpus import HEAD, STORE
 from tests.fuzz.mutations import Change

@@ -8,7 +8,7 @@ import pytest
 
 from pipeline.base.table import Table
 from pipeline.evaluate.baselines import BASELINES
-from pipeline.evaluate.experiments import SPANS, Experiment
+from pipeline.evaluate.experiments import SPANS, Experiment, JudgedDocument
 from pipeline.look.comparison import comparison_report, draw_experiments
 from pipeline.look.page.writing import PAGE, write_report
 
@@ -24,14 +24,14 @@ def experiments() -> list[Experiment]:
         rules = {
             (way, span): np.full((len(executed), 6), 0.7) for way in BASELINES for span in SPANS
         }
+        judged = {"model_type": expert, "fusion_strategy": "concat", "recipe": expert}
+        judged |= {"parameters": 1000, "samples": 1, "seed": 0}
         return Experiment(
             name=f"{expert}-concat",
-            model_type=expert,
-            fusion_strategy="concat",
-            recipe=expert,
+            judged=JudgedDocument.model_validate(
+                {"policy": judged, "on": {"test": {}}, "drawn": None}
+            ),
             seeds=tuple(range(len(executed))),
-            parameters=1000,
-            samples=1,
             groups=tuple(f"demo/{k}" for k in range(6)),
             entries={span: np.full(6, 10.0) for span in SPANS},
             errors=errors | rules,

@@ -29,7 +29,8 @@ from pipeline.train.batches import Windows
 from pipeline.train.predictions import predict
 from pipeline.train.run import policy_shape
 from pipeline.train.scores import action_space, compare
-from pipeline.train.split import Split, source_of, split_parts
+from pipeline.train.split import Split
+from pipeline.train.training_data import source_of, split_parts
 
 Sound = Callable[[Path], None]
 PARAMS = TrainHeadParams.model_validate(

@@ -33,8 +33,8 @@ from pipeline.policy.policy import Policy
 from pipeline.store import FeatureStore
 from pipeline.train.batches import Windows
 from pipeline.train.run import policy_shape
-from pipeline.train.split import source_of
 from pipeline.train.statistics import fit_normalization
+from pipeline.train.training_data import source_of
 
 WINDOWS = Windows(8, 65, 100, 0.1, 1.0)
 PARAMS = TrainHeadParams.model_validate(

@@ -9,9 +9,8 @@ from torch.nn import functional as F
 
 from pipeline.base.errors import ConfigError
 from pipeline.policy.diffusion import DiffusionActionExpert
-from pipeline.policy.expert import ActionExpert, GroupedLoss
+from pipeline.policy.expert import ActionExpert, GroupedLoss, Guide
 from pipeline.policy.flow_matching import FlowMatchingActionExpert
-from pipeline.policy.guidance import Guide
 from pipeline.policy.regression import RegressionActionExpert
 
 GROUPS = ("translation", "translation", "rotation", "gripper")

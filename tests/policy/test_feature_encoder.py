@@ -2,7 +2,7 @@ import pytest
 import torch
 
 from pipeline.policy.ages import fourier
-from pipeline.policy.feature_encoder import FeatureEncoder
+from pipeline.policy.encoders import FeatureEncoder
 
 
 @pytest.fixture

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from pipeline.base.errors import ConfigError
-from pipeline.policy.feature_encoder import FeatureEncoder
+from pipeline.policy.encoders import FeatureEncoder
 from pipeline.policy.fusion import CrossAttentionFusion, Fusion, GatedFusion, NoFusion, build_fusion
 
 DIM, HEADS = 16, 2

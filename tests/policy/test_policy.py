@@ -8,11 +8,11 @@ import torch
 from pipeline.base.config import SensorEncoderParams, TrainHeadParams
 from pipeline.base.errors import ConfigError
 from pipeline.policy.cost import describe_cost, flop_table
-from pipeline.policy.guidance import Guide
+from pipeline.policy.encoders import SensorEncoder
+from pipeline.policy.expert import Guide
 from pipeline.policy.normalization import Normalization
 from pipeline.policy.observation import PolicyShape, moving_channels
 from pipeline.policy.policy import Policy, Trainable, drop_streams
-from pipeline.policy.window_encoders import SensorEncoder
 
 BuildPolicy = Callable[..., Policy]
 Observe = Callable[..., Any]

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from pipeline.base.errors import ConfigError
 from pipeline.policy.ages import at_even_ages, even_ages
 from pipeline.policy.attention import right_aligned
-from pipeline.policy.window_encoders import (
+from pipeline.policy.encoders import (
     ForceAwareSensorEncoder,
     HalvingBlock,
     RobotStateEncoder,

@@ -13,8 +13,8 @@ import torch
 from pipeline.base.config import RolloutParams, Source
 from pipeline.base.errors import CheckpointMismatch, ConfigError
 from pipeline.data import open_recordings
-from pipeline.evaluate.rollouts import Rollouts, roll_out
-from pipeline.evaluate.served_rollouts import roll_out_served
+from pipeline.evaluate.rollout_driver import roll_out, roll_out_served
+from pipeline.evaluate.rollouts import Rollouts
 from pipeline.robot.client import PolicyClient
 from pipeline.robot.loop import StopKind
 from pipeline.robot.realtime import RunSettings, run_robot

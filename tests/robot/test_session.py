@@ -11,7 +11,7 @@ import torch
 
 from pipeline.base.config import RolloutParams
 from pipeline.base.errors import NumericsError, ObservationError
-from pipeline.evaluate.rollouts import roll_out
+from pipeline.evaluate.rollout_driver import roll_out
 from pipeline.policy.observation import moving_channels
 from pipeline.robot.chunking import Executor
 from pipeline.robot.session import Session

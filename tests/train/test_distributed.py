@@ -21,7 +21,7 @@ from pipeline.base.errors import ConfigError
 from pipeline.policy.checkpoint import load_policy
 from pipeline.store import FeatureStore, build_lock
 from pipeline.train.loop import Trainer
-from pipeline.train.world import World, process_device, process_group
+from pipeline.train.process_group import ProcessGroup, process_device, process_group
 
 ROOT = Path(__file__).resolve().parents[2]
 FAILURES = ("open 0", "open 1", "step 1")
@@ -35,7 +35,7 @@ import torch.distributed as dist
 import pipeline.train.loop as loop
 from pipeline.base.errors import StoreIncomplete
 from pipeline.store import FeatureStore
-from pipeline.train import world
+from pipeline.train import process_group
 from stages import train_head
 from stages.command import run
 
@@ -46,7 +46,7 @@ rank = os.environ["RANK"]
 def train_step(self, batches, interrupted):
     stopped = step(self, batches, interrupted)
     if self.step == hold:
-        if self.world.first:
+        if self.processes.first:
             print("holding", flush=True)
         while not interrupted():
             time.sleep(0.01)
@@ -64,7 +64,7 @@ def train(arguments, fails="", holds=None):
     hold = holds
     # Rank 0 is waited for where it fails too, however late; where it does not, for a moment.
     alone = fails.endswith("1")
-    world.PRECEDENCE = timedelta(seconds=0.2 if alone else 200)
+    process_group.PRECEDENCE = timedelta(seconds=0.2 if alone else 200)
     FeatureStore.open = fail if fails == f"open {rank}" else opened
     loop.Trainer.fit = fit if fails == f"step {rank}" else fitted
     return run("", train_head.main, arguments)
@@ -89,26 +89,26 @@ PRIMITIVES = """
 import torch
 from torch import nn
 from pipeline.base.errors import StoreLocked
-from pipeline.train.world import process_group
-from pipeline.train.world import SaidByFirst
+from pipeline.train.process_group import process_group
+from pipeline.train.process_group import FirstProcessFailed
 
-with process_group("cpu") as world:
-    rank = float(world.rank)
-    assert world.size == 2
-    assert world.shared(lambda: ("only", world.rank)) == ("only", 0)
+with process_group("cpu") as processes:
+    rank = float(processes.rank)
+    assert processes.size == 2
+    assert processes.shared(lambda: ("only", processes.rank)) == ("only", 0)
     kept = {"a": torch.full((2, 3), 7.0), "n": torch.tensor(5)}
-    found = world.tensors(kept if world.first else {})
+    found = processes.tensors(kept if processes.first else {})
     assert found["a"].tolist() == [[7.0] * 3] * 2 and found["n"].item() == 5
     double = torch.tensor([rank], dtype=torch.float64)
     several = [torch.full((3,), rank), torch.tensor(rank + 1), double]
-    world.sum(several)
+    processes.sum(several)
     assert [t.tolist() for t in several] == [[1.0] * 3, 3.0, [1.0]]
     # One parameter used by rank 1 alone, one by both, one by none.
     used = nn.ParameterList(torch.zeros(2) for _ in range(3))
-    used[0].grad = torch.ones(2) if world.rank == 1 else None
+    used[0].grad = torch.ones(2) if processes.rank == 1 else None
     used[1].grad = torch.full((2,), rank + 1)
     loss = {"loss": torch.tensor(rank)}
-    assert world.sum_gradients(used, loss, stop=world.rank == 1)
+    assert processes.sum_gradients(used, loss, stop=processes.rank == 1)
     assert used[0].grad.tolist() == [1.0, 1.0]
     assert used[1].grad.tolist() == [3.0, 3.0]
     assert used[2].grad is None
@@ -116,14 +116,14 @@ with process_group("cpu") as world:
     def locked():
         raise StoreLocked("held by another")
     try:
-        world.shared(locked)
+        processes.shared(locked)
     except StoreLocked:
-        assert world.first
-    except SaidByFirst as error:
-        assert not world.first and "held by another" in str(error)
+        assert processes.first
+    except FirstProcessFailed as error:
+        assert not processes.first and "held by another" in str(error)
     else:
         raise AssertionError("a failure on rank 0 went unheard")
-    print("done", world.rank, flush=True)
+    print("done", processes.rank, flush=True)
 """
 
 
@@ -337,11 +337,11 @@ def test_what_processes_tell_each_other(two_ranks: Callable[..., str], tmp_path:
     assert "done 1" in said
 
 
-def test_a_process_alone_is_a_world() -> None:
-    world = World.current()
-    assert (world.rank, world.size, world.first) == (0, 1, True)
+def test_a_process_alone_is_a_group_of_one() -> None:
+    processes = ProcessGroup.current()
+    assert (processes.rank, processes.size, processes.first) == (0, 1, True)
     with pytest.raises(ConfigError), process_group("cpu") as group:
-        assert group == world
+        assert group == processes
         raise ConfigError("as it is")
 
 
@@ -360,7 +360,7 @@ def test_every_process_has_a_gpu_of_its_own(monkeypatch: pytest.MonkeyPatch) -> 
     assert process_device("cpu").type == "cpu"
     asked: list[str] = []
     monkeypatch.setattr("torch.cuda.is_available", lambda: True)
-    monkeypatch.setattr("pipeline.train.world.resolve_device", asked.append)
+    monkeypatch.setattr("pipeline.train.process_group.resolve_device", asked.append)
     for name in ("auto", "cuda"):
         process_device(name)
     assert asked == ["cuda:1", "cuda:1"]

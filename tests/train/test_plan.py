@@ -11,21 +11,21 @@ import torch
 from pipeline.base.errors import ConfigError
 from pipeline.store import FeatureStore
 from pipeline.train.loop import Trainer
+from pipeline.train.process_group import ProcessGroup
 from pipeline.train.sampling import Plan, StepPart
 from pipeline.train.split import split_by_episode
-from pipeline.train.world import World
 
 Make = Callable[..., Any]
-ALONE = World()
+ALONE = ProcessGroup()
 
 
 @pytest.fixture
 def plan(store: FeatureStore, params: Make) -> Make:
-    """`plan(world, key=value, ...)`: the plan of small params."""
+    """`plan(processes, key=value, ...)`: the plan of small params."""
 
-    def make(world: World = ALONE, store: FeatureStore = store, **changed: Any) -> Plan:
+    def make(processes: ProcessGroup = ALONE, store: FeatureStore = store, **changed: Any) -> Plan:
         made = params(**changed)
-        return Plan(store, made, split_by_episode(store, made.split, made.horizon), world)
+        return Plan(store, made, split_by_episode(store, made.split, made.horizon), processes)
 
     return make
 
@@ -51,7 +51,7 @@ def test_parts_are_the_whole(store: FeatureStore, plan: Make, parts: int) -> Non
 @pytest.mark.parametrize("size", [2, 4])
 def test_processes_share_the_parts_of_one_that_accumulates(plan: Make, size: int) -> None:
     alone = plan(grad_accumulation=4)
-    together = [plan(World(rank, size), grad_accumulation=4 // size) for rank in range(size)]
+    together = [plan(ProcessGroup(rank, size), grad_accumulation=4 // size) for rank in range(size)]
     for step in (0, 1, 17):
         apart = [part for each in together for part in each.step(step)]
         assert described(apart) == described(alone.step(step))
@@ -77,11 +77,11 @@ def test_with_a_terminal_stop_every_step_counts(plan: Make) -> None:
 
 def test_fewer_ticks_than_parts_are_refused(store: FeatureStore, params: Make, plan: Make) -> None:
     with pytest.raises(ConfigError, match=r"8 parts of a step \(4 process\(es\) x"):
-        plan(World(0, 4), batch_size=7, grad_accumulation=2)
+        plan(ProcessGroup(0, 4), batch_size=7, grad_accumulation=2)
     made = params(batch_size=7, grad_accumulation=2)
     split = split_by_episode(store, made.split, made.horizon)
     with pytest.raises(ConfigError, match=r"^finetune\.batch_size is 7"):
-        Plan(store, made, split, World(0, 4), "finetune")
+        Plan(store, made, split, ProcessGroup(0, 4), "finetune")
 
 
 def test_variants_are_drawn_from_seed_and_step(

@@ -12,8 +12,8 @@ from pipeline.base.errors import CheckpointMismatch
 from pipeline.store import FeatureStore
 from pipeline.train.checkpoints import load_weights
 from pipeline.train.loop import Trainer
+from pipeline.train.process_group import ProcessGroup
 from pipeline.train.run import open_run
-from pipeline.train.world import World
 
 Make = Callable[..., Any]
 STEPS = 5
@@ -99,7 +99,7 @@ def test_parts_may_be_shared_out_anew_but_not_cut_anew(
     """What one process of two parts did is the run of two processes of one part, and no other."""
     shutil.copytree(of_two_parts, params().output)
     monkeypatch.setenv("WORLD_SIZE", str(size))
-    monkeypatch.setattr(World, "current", lambda: World(0, size))
+    monkeypatch.setattr(ProcessGroup, "current", lambda: ProcessGroup(0, size))
     given = params(grad_accumulation=accumulation, max_steps=2)
     assert open_run(given, store).status == status
     assert open_run(given, store, {"adapter": "another"}).status == "new"

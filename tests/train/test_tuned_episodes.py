@@ -24,7 +24,7 @@ from pipeline.base.tuned_on import (
 from pipeline.store import FeatureStore
 from pipeline.store.chunks import write_seal
 from pipeline.train.split import Split, split_by_episode
-from pipeline.train.tuned_episodes import refuse_tuned_episodes
+from pipeline.train.training_data import refuse_tuned_episodes
 
 Make = Callable[..., Path]
 

@@ -1,4 +1,4 @@
-"""Which recordings are held out together, and which ticks are read."""
+"""The folds of recordings that are held out together, and the ticks that are read."""
 
 from dataclasses import dataclass
 
@@ -12,7 +12,7 @@ from pipeline.train.batches import evenly
 from pipeline.train.groups import episodes_by_group
 
 _PARTS = 4
-"""Parts of each fold, at most, that are dealt anew as one: what bounds time and memory."""
+"""Parts of a fold at most, which are dealt as units: bounds time and memory."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,7 +26,7 @@ class ProbeFolds:
     deals: NDArray[np.int64]
     """(repeat, group): the fold that holds a recording out in each deal."""
     notes: tuple[str, ...]
-    """What the reader of a score has to know about the folds."""
+    """What a reader of the scores must know about the folds."""
 
     @property
     def count(self) -> int:
@@ -51,9 +51,9 @@ def fold_by_recording(
 
     Episodes that are one recording in several formats share a fold. Ticks whose chunk of `horizon`
     actions reaches beyond the episode's end are left out, so that all steps of the chunk are scored
-    on the same ticks; of the others, `max_ticks` are read, evenly spread and so of each episode its
-    share. Recordings no more than folds are each held out alone: there is one deal. Raises
-    `StoreMismatch` where fewer than two recordings have such ticks.
+    on the same ticks; at most `max_ticks` of the others are read, evenly spread. With no more
+    recordings than folds, each is held out alone, in a single deal. Raises `StoreMismatch` where
+    fewer than two recordings have such ticks.
     """
     recording = np.full(store.ticks, -1, np.int64)
     for index, episodes in enumerate(episodes_by_group(store).values()):
@@ -81,7 +81,7 @@ def fold_by_recording(
 
 
 def _deal(group: NDArray[np.int64], folds: int, repeats: int) -> NDArray[np.int64]:
-    """(repeat, group): as many parts of about as many ticks to each fold, by a fixed seed."""
+    """(repeat, group) the fold of each group: parts of about equal size, dealt by a fixed seed."""
     part = np.empty(group.max() + 1, np.int64)
     parts = min(_PARTS * folds, len(part))
     for index, (_, held) in enumerate(GroupKFold(parts).split(group, groups=group)):
@@ -91,7 +91,7 @@ def _deal(group: NDArray[np.int64], folds: int, repeats: int) -> NDArray[np.int6
 
 
 def _notes(store: FeatureStore, recordings: int, folds: int, horizon: int) -> list[str]:
-    """Why there are fewer ticks, recordings and folds than one may expect."""
+    """Notes on left-out ticks, and on fewer recordings and folds than expected."""
     notes = []
     if horizon > 1:
         notes.append(f"the last {horizon - 1} ticks of each episode lack a whole chunk: left out")

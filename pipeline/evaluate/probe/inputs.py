@@ -1,4 +1,4 @@
-"""What a regression reads at a tick: features of a row; actions, state and sensor before it."""
+"""The inputs of a regression at a tick: features of its row; past actions, state and sensor."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -16,30 +16,30 @@ from pipeline.train.statistics import check_finite
 from pipeline.vlm.slots import Slot
 
 Inputs = Float64[np.ndarray, "row _"]
-"""What a regression reads or predicts at each VL row or tick."""
+"""The inputs or targets of a regression at each VL row or tick."""
 Folds = Int64[np.ndarray, "repeat row"]
 """The fold that holds each row or tick out, in each deal."""
 PAST_ACTIONS = 2
-"""Actions before the tick that are known, as of the linear fit beside which policies stand."""
+"""Known actions before the tick, as many as the linear-fit baseline has."""
 WIDTH = 1024
-"""Inputs at most that a slot makes, or several together."""
+"""Inputs at most of a slot, or of several slots together."""
 STREAM_WIDTH = 64
 """Inputs at most of each summary of channels that share a unit."""
 LIMIT = 5.0
-"""Standard deviations from the mean, of any rows that are trained on in any deal, that are kept."""
+"""Columns are clipped at so many standard deviations from the mean of any training rows."""
 STILL = 0.1
-"""What spreads less than this share of its spread over all folds, in rows that are trained on, is
-taken as constant."""
+"""A column counts as constant where its spread in some training rows is below this share of its
+spread over all rows."""
 _ROUNDING = 1e-6
 
 
 @dataclass(frozen=True)
 class SlotName(Slot):
-    """What a slot or a group of slots is: of a group, `view` and `cell` are None."""
+    """The name of a slot, or of a group of slots, whose `view` and `cell` are None."""
 
     @property
     def group(self) -> "SlotName":
-        """The choice of layer, norm and pooling that gave it."""
+        """Its choice of layer, norm and pooling."""
         return SlotName(self.layer, self.norm, self.pooling)
 
     @property
@@ -55,8 +55,8 @@ def read_slots(
 ) -> tuple[Inputs, Bool[np.ndarray, " row"]]:
     """These slots of the VL `rows` as inputs side by side, and where at least one is valid.
 
-    `fold` is the fold that holds each row out. The slots share `WIDTH` inputs, each on its main
-    directions where its channels are more; one that is not valid stands at its mean, which is 0.
+    `fold` is the fold that holds each row out. The slots share `WIDTH` inputs; a slot with more
+    channels is reduced to its main directions. An invalid slot is at its mean, which is 0.
     Raises `NumericsError` on NaN or inf, naming the place.
     """
     inputs: list[Inputs] = [np.empty((len(rows), 0))]
@@ -73,9 +73,9 @@ def read_slots(
 
 
 def past_actions(store: FeatureStore, ticks: Int64[np.ndarray, " row"], fold: Folds) -> Inputs:
-    """The actions of the `PAST_ACTIONS` ticks before each; of an episode's first ticks the mean.
+    """The actions of the `PAST_ACTIONS` ticks before each; the mean before an episode's start.
 
-    Without them what a slot tells of the robot's own motion would count as knowledge of the scene.
+    With them as inputs, a slot gains nothing by telling the robot's own motion.
     """
     action, start = store.array("tick/action"), store.array("episode/tick_start")
     first = start[store.episode_of(ticks)]
@@ -99,11 +99,11 @@ def summarize(
 ) -> Inputs:
     """The last, the mean and the spread of every channel over the window before each tick.
 
-    No column where the store lacks the stream. Channels of one unit that are more than
-    `STREAM_WIDTH`, as those of an A-scan, are projected on that many main directions of each
-    summary, so a force beside them is not lost. Nothing is later than its tick; a tick without a
-    reading has the mean of those with one, and a column that says so. `fold` is the fold that holds
-    each tick out. Raises `NumericsError` on NaN or inf, naming the place.
+    No column where the store lacks the stream. More than `STREAM_WIDTH` channels of one unit, such
+    as an A-scan's, are reduced to that many main directions of each summary, so that a force beside
+    them is not lost. No reading is later than its tick. A tick without a reading has the mean of
+    the others, and a last column marks it. `fold` is the fold that holds each tick out.
+    Raises `NumericsError` on NaN or inf, naming the place.
     """
     inputs: list[Inputs] = [np.empty((len(ticks), 0))]
     units: list[str] = store.streams[stream]["units"]
@@ -146,7 +146,7 @@ def _summaries(
 
 
 def reduce(values: Float[np.ndarray, "row channel"], fold: Folds, width: int) -> Inputs:
-    """Standardised channels, or at most `width` main directions of them, within `limit`."""
+    """Standardised channels, or at most `width` main directions of them, clipped by `limit`."""
     columns = StandardScaler().fit_transform(values.astype(np.float64))
     width = min(width, len(columns))
     if width < columns.shape[1]:
@@ -157,17 +157,17 @@ def reduce(values: Float[np.ndarray, "row channel"], fold: Folds, width: int) ->
 
 
 def limit(columns: Inputs, fold: Folds) -> Inputs:
-    """Columns of mean 0 and spread 1 over all folds, kept near to what every fold is trained on.
+    """Columns of mean 0 and spread 1 over all folds, clipped to what every fold is trained on.
 
-    A joint that rests in all recordings but one has a spread of about 0 in what is trained on when
-    that one is held out; in such units it would then be thousands, and so would the prediction. So
-    a column z, of mean m_f and spread s_f over the rows of all folds but f, becomes
+    A joint that moves in one recording only has a spread of about 0 in the training rows when that
+    one is held out; in such units it would be thousands there, and so would the prediction. So a
+    column z, of mean m_f and spread s_f over the rows of all folds but f, becomes
 
         min(max(z, max_f(m_f - LIMIT s_f)), min_f(m_f + LIMIT s_f))
 
-    and 0 where some s_f < `STILL` s, or the limits cross: nothing can be learnt of it from other
-    recordings. f runs over the folds of all deals, so that the same inputs serve them all. This
-    reads the inputs of all folds, which say nothing of any action.
+    and 0 where some s_f < `STILL` s or the limits cross: other recordings teach nothing about it.
+    f runs over the folds of all deals, so that the same inputs serve all of them. This reads inputs
+    of all folds, but no action.
     """
     held = fold[:, None] == np.arange(fold.max() + 1)[:, None]
     trained = 1.0 - held.reshape(-1, len(columns))

@@ -1,11 +1,11 @@
 """Ridge regression, cross-validated by folds; a fold's penalties are chosen on the others.
 
 The coefficients that minimise |y - Xb|^2 + penalty * n * |b|^2 over n rows solve
-(X'X + penalty * n * I) b = X'y (Hoerl & Kennard 1970, eq. 2.1), as `sklearn.linear_model.Ridge`
-does; the intercept has no penalty. A penalty an input is the general form (section 5 there), and
-each block of inputs has one of its own. X'X of the rows that always share a fold is taken once and
-serves all deals, folds and penalties, where `Ridge` takes it again each time; what is known beside
-the inputs is regressed out of them once for all their penalties (Frisch & Waugh 1933).
+(X'X + penalty * n * I) b = X'y (Hoerl & Kennard 1970, eq. 2.1); the intercept has no penalty, and
+each block of inputs has its own (section 5 there). `sklearn.linear_model.Ridge` computes X'X anew
+at every fit, and `RidgeCV` holds out rows, not recordings. Here X'X of the rows that always share a
+fold serves all deals, folds and penalties, and the known blocks are regressed out of the inputs
+once for all penalties (Frisch & Waugh 1933).
 """
 
 from collections.abc import Sequence
@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
 
 from pipeline.base.errors import NumericsError
-from pipeline.evaluate.figures import Figure
-from pipeline.evaluate.intervals import bootstrap_means
+from pipeline.evaluate.figures import Figure, bootstrap_means
 from pipeline.evaluate.probe.folds import ProbeFolds
 from pipeline.evaluate.probe.inputs import Inputs
 
@@ -31,7 +30,7 @@ _VARIES = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class ProbeScore:
-    """How much of the action chunk inputs predict on recordings that they were not fitted on."""
+    """How well inputs predict the action chunk on held-out recordings."""
 
     losses: NDArray[np.float64]
     """(repeat, group, target): squared errors of a held-out recording's ticks, summed, in units of
@@ -65,17 +64,17 @@ class ProbeScore:
         return self.r2.value
 
     def gain(self, known: "ProbeScore") -> Figure:
-        """What this explains more than `known` does of the same recordings, in the same deals."""
+        """The R^2 of this less that of `known`, on the same recordings in the same deals."""
         return estimate(self.explained - known.explained, self.rows)
 
 
 def estimate(explained: NDArray[np.float64], rows: NDArray[np.float64]) -> Figure:
     """R^2 from what is `explained` (repeat, group) of each recording's `rows`, and its interval.
 
-    The mean over the deals of repeated cross-validation (Burman 1989). The interval has the
-    percentiles over all deals, in each of which recordings are drawn with replacement
-    (`bootstrap_means`), the same ones for all: it covers the choice of recordings and of folds.
-    Regressions are not fitted anew to each draw.
+    The value is the mean over the deals of repeated cross-validation (Burman 1989). The interval
+    covers the choice of recordings and of folds: its percentiles are over all deals, in each of
+    which the same recordings are drawn with replacement (`bootstrap_means`). Regressions are not
+    fitted anew to each draw.
     """
     draws = bootstrap_means(explained.T, rows[:, None])
     return Figure.of(float(explained.sum(axis=1).mean() / rows.sum()), draws.ravel())
@@ -90,11 +89,11 @@ def cross_validate(
 ) -> ProbeScore:
     """The score of ridge regression from `inputs`, which spread by about 1 over all rows.
 
-    Each fold of each deal is predicted from the others, with the penalty by which these are
-    predicted best, each from all folds but itself, over all targets in units of their spread.
-    Beside the inputs stand the blocks that are `known`, each with its penalties (repeat, fold): one
-    penalty for all would make a few good inputs pay for many idle ones. Raises `NumericsError` for
-    a penalty that is too small for float64.
+    Each fold of each deal is predicted from the others, with the penalty that predicts those best,
+    each from all folds but itself, over all targets in units of their spread. The blocks of `known`
+    inputs are used too, each with its own penalties (repeat, fold): one penalty for all would make
+    a few good inputs pay for many idle ones. Raises `NumericsError` for a penalty that is too small
+    for float64.
     """
     order = np.argsort(folds.group, kind="stable")
     group = folds.group[order]

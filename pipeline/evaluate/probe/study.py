@@ -1,4 +1,4 @@
-"""Every slot and every group of slots, scored by what a linear reader finds in it, and ranked."""
+"""Every slot and group of slots, scored by a linear regression from it to the action chunk."""
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -26,24 +26,24 @@ _ROUNDING = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class ProbeResult:
-    """How well a slot or a group of slots predicts; where it is not valid, its mean stands."""
+    """How well a slot or a group of slots predicts; where it is invalid, by its mean."""
 
     name: SlotName
     slots: tuple[int, ...]
     channels: int
     """Of all its slots together."""
     inputs: int
-    """That the regression had of them."""
+    """Number of inputs of the regression."""
     valid_share: float
-    """Of the ticks, those at which one of its slots is valid."""
+    """Share of the ticks at which one of its slots is valid."""
     alone: ProbeScore
     beside: ProbeScore
-    """With all that is known without features; what it is ranked by."""
+    """With all inputs that are known without features; results are ranked by it."""
 
 
 @dataclass(frozen=True, eq=False)
 class Known:
-    """What is known without features, as far as one more block of inputs, and how it predicts."""
+    """The inputs known without features, up to one more block, and how well they predict."""
 
     name: str
     inputs: int
@@ -52,7 +52,7 @@ class Known:
 
 @dataclass(frozen=True, eq=False)
 class ProbeStudy:
-    """All results, and what they are measured against."""
+    """All results, and the baselines beside them."""
 
     horizon: int
     action_names: tuple[str, ...]
@@ -66,11 +66,11 @@ class ProbeStudy:
 
     @property
     def baseline(self) -> Known:
-        """All that is known without features."""
+        """All inputs that are known without features."""
         return self.known[-1]
 
     def gain(self, result: ProbeResult) -> Figure:
-        """What a result adds to the baseline."""
+        """The R^2 that a result adds to the baseline."""
         return result.beside.gain(self.baseline.score)
 
 
@@ -79,26 +79,26 @@ class Recommendation:
     """The choice of layer, norm and pooling that the evidence supports."""
 
     reading: Literal["beside", "alone"]
-    """What it rests on: `beside` what is known where a choice gains so, else `alone`."""
+    """The scores it rests on: `beside` where a choice gains beside what is known, else `alone`."""
     best: ProbeResult
     """With the highest score of those that gain."""
     chosen: ProbeResult
-    """Of `best` and those tied with it, the one with the fewest slots, then the lowest layer: it
-    costs the least to extract, to keep and to read."""
+    """Of `best` and those tied with it, the one with the fewest slots, then the lowest layer, which
+    costs the least."""
     tied: tuple[ProbeResult, ...]
-    """The others that gain, not to be told from `best`."""
+    """The others that gain and do not differ from `best`."""
 
 
 def probe(store: FeatureStore, params: ProbeParams) -> ProbeStudy:
     """Ridge regression from every slot of variant 0 to the action chunk, cross-validated.
 
-    Alone, and beside what is known without features: the actions of the ticks before, and the last,
-    mean and spread of the causal windows of state and sensor. Each of these blocks has a penalty of
-    its own, chosen in their order; each slot stands by itself and each choice of layer, norm and
-    pooling as a whole. Folds hold whole recordings, so nothing that tells a recording from another
-    helps, and are dealt `params.repeats` times. Each of `params.threads` threads has one slot or
-    one group in memory, which grows with `params.max_ticks`. The same store and params give the
-    same bits, whatever the threads. A bar shows the progress on a terminal.
+    Each slot and each choice of layer, norm and pooling is scored alone, and beside the inputs that
+    are known without features: the actions of the ticks before, and the last, mean and spread of
+    the causal windows of state and sensor. Each of these blocks has its own penalty, chosen in
+    their order. Folds hold whole recordings and are dealt `params.repeats` times. Each of
+    `params.threads` threads has one slot or group in memory, which grows with `params.max_ticks`.
+    The same store and params give the same bits for any number of threads. A bar shows the progress
+    on a terminal.
 
     Raises `StoreMismatch` where fewer than two recordings are long enough, and `NumericsError` on
     NaN or inf, naming the place.
@@ -186,13 +186,12 @@ def ranked(results: Sequence[ProbeResult]) -> list[ProbeResult]:
 
 
 def recommend(study: ProbeStudy) -> Recommendation | None:
-    """Among the groups that gain; None where none does.
+    """The recommendation among the groups that gain; None where no group does.
 
-    A group gains where the interval of its R^2 is above 0, and where it is better than what is
-    known without features and than the mean action.
-    One is better than another where the interval of the difference is above 0. Two that gain are
-    tied where the first is not better and the second keeps half of its gain: a wide interval of few
-    recordings would tie anything.
+    A group gains where the interval of its R^2 is above 0, and where it is better than the inputs
+    known without features and than the mean action. "Better" means that the interval of the
+    difference is above 0. A group is tied with the best where the best is not better and the group
+    keeps half of its gain: with few recordings, wide intervals alone would tie anything.
     """
     readings: tuple[Literal["beside", "alone"], ...] = ("beside", "alone")
     for reading in readings:
@@ -222,6 +221,6 @@ def recommend(study: ProbeStudy) -> Recommendation | None:
 
 
 def _is_better(score: ProbeScore, other: ProbeScore) -> bool:
-    """Resolved, as `recommend` says."""
+    """Whether the interval of the difference is above 0."""
     gain = score.gain(other)
     return gain.value > _ROUNDING and bool(gain.resolved)

@@ -1,4 +1,4 @@
-"""Results of a probe -> what is printed and what is written."""
+"""The results of a probe as printed text, as `metrics.json` and as CSV files."""
 
 import json
 from pathlib import Path
@@ -8,8 +8,7 @@ import numpy as np
 
 from pipeline.base.durable import write_document
 from pipeline.base.table import Table
-from pipeline.evaluate.figures import Figure
-from pipeline.evaluate.names import rounded
+from pipeline.evaluate.figures import Figure, rounded
 from pipeline.evaluate.probe.study import ProbeResult, ProbeStudy, ranked, recommend
 
 TOP = 12
@@ -34,7 +33,7 @@ def write_tables(folder: Path, study: ProbeStudy) -> list[Path]:
 
 
 def metrics(study: ProbeStudy) -> dict[str, Any]:
-    """The essential numbers: what was read, the baselines, each group, and the recommendation."""
+    """The content of metrics.json: ticks, baselines, each group, and the recommendation."""
     document: dict[str, Any] = {
         "ticks": len(study.folds.ticks),
         "recordings": study.folds.recordings,
@@ -95,7 +94,7 @@ def table(study: ProbeStudy) -> str:
 
 
 def advice(study: ProbeStudy) -> str:
-    """The lines of params.yaml that the evidence supports, and how sure it is."""
+    """The lines of params.yaml that the results support, and how clearly."""
     advised = recommend(study)
     if advised is None:
         return (
@@ -155,8 +154,8 @@ def _target_rows(study: ProbeStudy) -> list[dict[str, Any]]:
         named = {head: _row(study, result)[head] for head in ("layer", "norm", "pooling")}
         scores = {"alone": result.alone, "beside": result.beside, "known": study.baseline.score}
         for index, (step, channel) in enumerate(targets):
-            told = {f"r2_{reading}": score.by_target[index] for reading, score in scores.items()}
-            rows.append({**named, "step": step, "channel": channel, **told})
+            r2 = {f"r2_{reading}": score.by_target[index] for reading, score in scores.items()}
+            rows.append({**named, "step": step, "channel": channel, **r2})
     return rows
 
 

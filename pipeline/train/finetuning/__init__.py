@@ -1,14 +1,14 @@
-"""Tuning the vision-language model end to end, below the policy that `train_head` describes.
+"""Tuning the vision-language model end to end, with the policy that `train_head` describes.
 
-`recordings` finds the frames of a store's rows, `rows` decodes them and puts them beside the
-store's batches, `feature_source` stands before the policy in the one training loop.
+`recordings` opens the recordings of a store, `rows` decodes the frames of its rows beside its
+batches, `feature_source` puts the model before the policy in the one training loop.
 """
 
 from pipeline.train.finetuning.feature_source import (
-    LiveFeatures,
+    ModelFeatureSource,
     head_params,
     next_steps,
     out_of_memory_named,
 )
 
-__all__ = ["LiveFeatures", "head_params", "next_steps", "out_of_memory_named"]
+__all__ = ["ModelFeatureSource", "head_params", "next_steps", "out_of_memory_named"]

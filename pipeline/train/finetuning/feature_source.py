@@ -1,4 +1,4 @@
-"""What stands before the policy when the model itself learns."""
+"""The model before the policy, when the model itself learns."""
 
 from collections.abc import Generator, Iterable
 from contextlib import contextmanager
@@ -28,21 +28,21 @@ from pipeline.train.finetuning.recordings import (
     known_digests,
 )
 from pipeline.train.finetuning.rows import LiveFeed, LiveRows
-from pipeline.train.world import World
+from pipeline.train.process_group import ProcessGroup
 from pipeline.vlm.feature_spec import FeatureSpec, feature_spec
 from pipeline.vlm.live import LiveVLM
 from pipeline.vlm.preparation import Preparer
 
 ADAPTER, CHECKPOINT = "adapter", "checkpoint"
 _FREE_TUNING = {"gradient_checkpointing"}
-"""What of the tuning decides no number."""
+"""Keys of the tuning that decide no number."""
 
 
-class LiveFeatures(FeatureSource):
-    """Features from a model that learns, over a store's recordings."""
+class ModelFeatureSource(FeatureSource):
+    """Features from a model that learns, on the recordings of a store."""
 
     def __init__(self, store: FeatureStore, params: Params, device: torch.device) -> None:
-        """The model is loaded when a policy is attached.
+        """`attach` loads the model.
 
         Raises `StoreMismatch` where `vlm` does not give the store's features, or a recording is
         missing or not what it was at extraction.
@@ -56,8 +56,8 @@ class LiveFeatures(FeatureSource):
                 check_recordings(store, recordings, digests)
             return spec
 
-        # Once for all processes: they would read the same files and say the same.
-        self._spec = World.current().shared(checked)
+        # Once for all processes: they would read the same files.
+        self._spec = ProcessGroup.current().shared(checked)
         self._vlm, self._finetune = params.vlm, params.finetune
         self._device = device
         self._rows = LiveRows(store, recordings, Preparer(params.vlm, self._spec))
@@ -73,9 +73,9 @@ class LiveFeatures(FeatureSource):
 
     @property
     def golden(self) -> tuple[GoldenRow, ...]:
-        """None: the store's are features of the model before it learned.
+        """No rows: the store's have features of the model before it learned.
 
-        The head that is trained on the tuned model's own store carries that store's.
+        A head that is trained on the tuned model's own store carries that store's rows.
         """
         return ()
 
@@ -93,7 +93,7 @@ class LiveFeatures(FeatureSource):
         return module.policy
 
     def parameter_lr(self, name: str) -> float | None:
-        """`finetune.lr` for what is the model's."""
+        """`finetune.lr` for parameters of the model."""
         return self._finetune.lr if name.startswith("vlm.") else None
 
     def feed(
@@ -104,24 +104,24 @@ class LiveFeatures(FeatureSource):
         return LiveFeed(self.store, self._rows, plan, windows, device, threads)
 
     def save(self, folder: Path, module: Trainable) -> None:
-        """Write what the model has learned and on which episodes, and into `policy.json` whose
-        features the policy takes.
+        """Write the tuned weights, the episodes they learned from, and the feature spec they give.
 
-        The policy is evaluated on a store that was extracted with this adapter or checkpoint, and
-        refused on the one whose ticks it was trained on. Raises `DiskFull`.
+        With that spec in `policy.json`, the policy fits a store that was extracted with this
+        adapter or checkpoint, and not the store whose ticks it was trained on. Raises
+        `DiskFull`.
         """
         assert isinstance(module, LivePolicy)
         assert module.vlm is not None
         learned = folder / learned_name(self._finetune)
         module.vlm.save(learned)
         path = folder / DOCUMENT
-        document, said = read_document(path, PolicyDocument)
+        document, content = read_document(path, PolicyDocument)
         before, own = of_store(self.store.attrs, self.store.path), TunedOn.of_split(document.split)
         write_tuned_on(learned, joined([before, own]) or own)
-        write_with_digest(path, said | {"feature_spec": self._tuned_spec(folder).attrs()})
+        write_with_digest(path, content | {"feature_spec": self._tuned_spec(folder).attrs()})
 
     def summary(self) -> list[str]:
-        """What learns and from which frames, as lines for the user."""
+        """Lines for the user: what learns, and from which frames."""
         tuning = self._finetune.tuning
         rank = f" of rank {tuning.lora_r}" if tuning.method == "lora" else ""
         lines = [
@@ -137,25 +137,25 @@ class LiveFeatures(FeatureSource):
         return lines
 
     def _tuned_spec(self, folder: Path) -> FeatureSpec:
-        """What `extract` will name the features of the model in this checkpoint."""
+        """The feature spec that `extract` will give the model in this checkpoint."""
         learned = str(folder / learned_name(self._finetune))
-        given = {"adapter": learned}
+        changes = {"adapter": learned}
         if self._finetune.tuning.method == "full":
-            given = {"checkpoint": learned, "revision": None, "adapter": None}
-        vlm = self._vlm.model_copy(update=given)
+            changes = {"checkpoint": learned, "revision": None, "adapter": None}
+        vlm = self._vlm.model_copy(update=changes)
         storage = self._spec.document["storage_dtype"]
 
         def digest(path: Path) -> str:
-            # The base's files are read once; what learns is another at every checkpoint.
+            # The base's files are read once; the tuned ones change with every checkpoint.
             return file_digest(path) if path.is_relative_to(folder) else self._base_digest(path)
 
         return feature_spec(vlm, storage, self._spec.views, digest)
 
 
 def head_params(params: Params) -> TrainHeadParams:
-    """`train_head` with what stands in `finetune` laid over it, and nothing compiled.
+    """`train_head` with the values of `finetune` in place of its own, and nothing compiled.
 
-    Raises `ConfigError` where that leaves nothing of the model to learn, or nothing to learn from.
+    Raises `ConfigError` where nothing of the model would learn, or the policy would not see it.
     """
     if params.finetune.tuning.method == "none":
         raise ConfigError(
@@ -168,16 +168,16 @@ def head_params(params: Params) -> TrainHeadParams:
             "train_head.features_enabled is false, so the policy would not see the model that is "
             "tuned. Set it to true."
         )
-    # `lr` is of the model alone; rows are objects of many shapes, which torch.compile cannot take.
-    given = {"lr": params.train_head.lr, "compile": False}
+    # `finetune.lr` is the model's; rows have many shapes, which torch.compile cannot take.
+    kept = {"lr": params.train_head.lr, "compile": False}
     shared = TrainHeadParams.model_fields.keys() & FinetuneParams.model_fields.keys()
-    laid_over = {name: getattr(params.finetune, name) for name in shared} | given
-    return params.train_head.model_copy(update=laid_over)
+    changes = {name: getattr(params.finetune, name) for name in shared} | kept
+    return params.train_head.model_copy(update=changes)
 
 
 @contextmanager
 def out_of_memory_named() -> Generator[None]:
-    """Turn a GPU that is too small into `ConfigError` saying what takes less."""
+    """Raise `ConfigError`, saying what takes less memory, where the GPU has too little."""
     try:
         yield
     except torch.cuda.OutOfMemoryError as error:
@@ -190,12 +190,12 @@ def out_of_memory_named() -> Generator[None]:
 
 
 def learned_name(finetune: FinetuneParams) -> str:
-    """The folder, within a checkpoint's, of what the model has learned."""
+    """The folder of the tuned weights within a checkpoint's."""
     return ADAPTER if finetune.tuning.method == "lora" else CHECKPOINT
 
 
 def next_steps(finetune: FinetuneParams, store: FeatureStore) -> list[str]:
-    """What to run with a tuned model, as lines for the user."""
+    """Lines for the user: what to run with the tuned model."""
     learned = finetune.output / "best" / learned_name(finetune)
     tuned = store.path.with_name(f"{store.path.stem}_tuned.zarr")
     model = [setting("vlm.adapter", learned)]

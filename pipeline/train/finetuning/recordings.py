@@ -1,4 +1,4 @@
-"""The recordings that a store was made from, found again and known to be the same."""
+"""The recordings that a store was extracted from, opened again and compared with it."""
 
 from collections.abc import Sequence
 from contextlib import closing
@@ -11,7 +11,7 @@ from pipeline.base.digests import ContentDigests, ledger_path
 from pipeline.base.errors import RecordingError, StoreMismatch
 from pipeline.data import Opened, Recording, content_digest, open_recordings
 from pipeline.store import Episode, FeatureStore, episode_name
-from pipeline.train.split import list_differences
+from pipeline.train.training_data import list_differences
 from pipeline.vlm.feature_spec import FeatureSpec, feature_spec
 
 _SHOWN = 5
@@ -36,7 +36,7 @@ def check_recordings(
 ) -> None:
     """Raise `StoreMismatch` where a recording is not what it was when the store was extracted.
 
-    `recordings` are those of `find_recordings`. A file is read where its digest is not known yet.
+    `recordings` are those of `find_recordings`. Files whose digest is not known yet are read.
     """
     changed: list[tuple[Episode, str]] = []
     pairs = list(zip(store.episodes, recordings, strict=True))
@@ -45,8 +45,8 @@ def check_recordings(
             if content_digest(recording, digests.of) != episode.content:
                 changed.append((episode, f"the files in {recording.path} changed since extraction"))
             elif recording.instruction != episode.instruction:
-                told = f"{episode.instruction!r} at extraction, {recording.instruction!r} now"
-                changed.append((episode, f"its instruction was {told}"))
+                before, now = repr(episode.instruction), repr(recording.instruction)
+                changed.append((episode, f"its instruction was {before} at extraction, {now} now"))
         except RecordingError as error:
             changed.append((episode, str(error)))
     if changed:
@@ -73,7 +73,7 @@ def check_spec(store: FeatureStore, params: Params, digests: ContentDigests) -> 
 
 
 def known_digests(store: FeatureStore) -> "closing[ContentDigests]":
-    """The ledger that extraction keeps beside a store, to be closed."""
+    """The ledger of digests that extraction keeps beside a store; closed at the end of a `with`."""
     return closing(ContentDigests(ledger_path(store.path)))
 
 

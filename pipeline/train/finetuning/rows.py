@@ -1,7 +1,7 @@
-"""Batches of a store with the VL rows that a live model has to see, decoded from the recordings.
+"""Batches of a store with the VL rows that a live model sees, decoded from the recordings.
 
-Any frame of a folder of JPEG files costs the same, but in a video every frame since a key frame has
-to be decoded: so rows of one episode are read together and in order, and prepared rows are kept.
+In a video every frame since a key frame has to be decoded, so rows of one episode are read together
+and in order, and prepared rows are kept.
 """
 
 import threading
@@ -23,9 +23,9 @@ from pipeline.train.batches import BatchIndices, Prefetch, Windows
 from pipeline.vlm.preparation import PreparedRow, Preparer
 
 CACHE_BYTES = 2**30
-"""Of prepared rows that are kept: all of a small data set, so that it is decoded once."""
+"""Bytes of prepared rows that are kept: a small data set is decoded once."""
 _OPEN_EPISODES = 1024
-"""Whose cameras are kept open, with their lists of frames."""
+"""Episodes whose cameras and lists of frames are kept open."""
 
 
 class LiveRows:
@@ -48,7 +48,7 @@ class LiveRows:
         self._lock = threading.Lock()
 
     def prepare(self, rows: NDArray[np.int64]) -> list[PreparedRow]:
-        """Rows, ascending, best of one episode: its videos are read in one pass, never backwards.
+        """Prepare these ascending rows; those of one episode are read in one pass, never backwards.
 
         Raises `RecordingError` where a frame cannot be decoded.
         """
@@ -62,7 +62,7 @@ class LiveRows:
         return [prepared[row] for row in rows.tolist()]
 
     def _keep(self, row: int, prepared: PreparedRow) -> None:
-        """Keep a row in place of those that are kept the longest."""
+        """Keep a row, in place of the rows that were kept first."""
         with self._lock:
             if row not in self._kept:
                 self._kept[row] = prepared
@@ -74,15 +74,15 @@ class LiveRows:
 
 @dataclass
 class LiveBatch(Batch, LiveObservation):
-    """A batch and the rows that its features are to be computed from, each distinct one once."""
+    """A batch, and the distinct rows that its features are computed from."""
 
 
 class LiveFeed(Prefetch):
     """Hands out `(indices, live batch)` for each entry of a plan, in its order.
 
-    The distinct VL rows of each batch are decoded by `threads` threads, as many batches ahead.
-    Every variant of a row is the plain frames: others exist in the store only. An exception in a
-    recording, too, comes out of `next` at the batch it belongs to.
+    `threads` threads decode the distinct VL rows of each batch, as many batches ahead. Only plain
+    frames are decoded: other variants exist in the store alone. An exception in a recording comes
+    out of `next` at the batch it belongs to.
     """
 
     def __init__(
@@ -115,7 +115,7 @@ class LiveFeed(Prefetch):
         self._pool.shutdown(cancel_futures=True)
 
     def _announce(self, indices: BatchIndices) -> BatchIndices:
-        """Begin with the rows of a batch; called in the thread that consumes the plan, in order."""
+        """Start to decode the rows of a batch; runs in the thread that consumes the plan."""
         episode = self._store.episode_of(indices.ticks)
         seen = self._store.gatherer.vl_rows(indices.ticks, episode, indices.lags.features)
         distinct, row_of = np.unique(seen, return_inverse=True)

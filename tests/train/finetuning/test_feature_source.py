@@ -20,13 +20,13 @@ from pipeline.policy.checkpoint import find_policy, load_policy
 from pipeline.policy.live_policy import LivePolicy
 from pipeline.store import FeatureStore
 from pipeline.train.batches import BatchIndices, Windows
-from pipeline.train.finetuning import LiveFeatures, head_params, out_of_memory_named
+from pipeline.train.finetuning import ModelFeatureSource, head_params, out_of_memory_named
 from pipeline.train.loop import Trainer
 from pipeline.train.predictions import predict
 from pipeline.train.run import open_run
 from pipeline.train.scores import action_space, compare
-from pipeline.train.split import check_store, find_ticks, split_by_episode
-from pipeline.train.tuned_episodes import refuse_tuned_episodes
+from pipeline.train.split import split_by_episode
+from pipeline.train.training_data import check_store, find_ticks, refuse_tuned_episodes
 from pipeline.vlm.feature_spec import feature_spec
 
 CPU = torch.device("cpu")
@@ -36,7 +36,7 @@ def trainer(params: Params) -> Trainer:
     """A trainer that begins anew or goes on with what lies at `finetune.output`."""
     store = FeatureStore.open(params.extract.store)
     head = head_params(params)
-    front = LiveFeatures(store, params, CPU)
+    front = ModelFeatureSource(store, params, CPU)
     run = open_run(head, store, front.identity)
     return Trainer(store, head, split_by_episode(store, head.split, 2), run, front)
 
@@ -193,8 +193,8 @@ def test_parts_of_a_step_give_the_whole_step(params: Callable[..., Params], tmp_
 def test_a_setting_that_decides_the_numbers_is_another_run(
     store: FeatureStore, params: Callable[..., Params], changed: dict[str, Any], another: bool
 ) -> None:
-    before = LiveFeatures(store, params(), CPU).identity
-    after = LiveFeatures(store, params(finetune=changed), CPU).identity
+    before = ModelFeatureSource(store, params(), CPU).identity
+    after = ModelFeatureSource(store, params(finetune=changed), CPU).identity
     assert (before != after) == another
     json.dumps(before)
 
@@ -225,12 +225,12 @@ def test_what_is_not_used_of_a_store_is_said(params: Callable[..., Params], tmp_
     given = Params.model_validate(document)
     extract(given, say=lambda _: None)
     store = FeatureStore.open(given.extract.store)
-    front = LiveFeatures(store, given, CPU)
+    front = ModelFeatureSource(store, given, CPU)
     assert any("1 augmented variant(s) of each row are not used" in s for s in front.summary())
     draw = BatchIndices(np.arange(6), variants=np.ones(6, np.int64))
     with front.feed([draw], Windows(2, 1, 1), CPU) as feed:
         _, live = next(iter(feed))
-    with LiveFeatures(FeatureStore.open(params().extract.store), params(), CPU).feed(
+    with ModelFeatureSource(FeatureStore.open(params().extract.store), params(), CPU).feed(
         [BatchIndices(np.arange(6))], Windows(2, 1, 1), CPU
     ) as feed:
         _, plain = next(iter(feed))

@@ -1,4 +1,4 @@
-"""The processes of one training, alone or several that torchrun started, and how they stop."""
+"""The processes of one training, which is one alone or several of torchrun, and how they stop."""
 
 import os
 import signal
@@ -20,25 +20,25 @@ from pipeline.base.errors import ConfigError, PipelineError
 Outcome = TypeVar("Outcome")
 
 PATIENCE = timedelta(hours=12)
-"""How long a process waits for another: rank 0 fits the normalisation and evaluates while others
-wait. A process that died is not waited for: torchrun ends the rest."""
+"""How long a process waits for another: the others wait while rank 0 fits the normalisation and
+evaluates. Nobody waits for a process that died: torchrun ends the rest."""
 AT_ONCE = 32
-"""So many gradients are summed over the processes at a time: few calls, little copied."""
+"""Gradients that are summed over the processes in one call: few calls, little copied."""
 PRECEDENCE = timedelta(seconds=5)
-"""How long a process that fails waits for rank 0, which mostly fails of the same, to say so."""
-_SPEAKER = "speaker"
+"""How long a process that fails waits for rank 0, which mostly fails of the same, to report it."""
+_REPORTER = "reporter"
 FROM_TORCHRUN = ("RANK", "WORLD_SIZE", "LOCAL_RANK", "MASTER_ADDR", "MASTER_PORT")
 
 
-class SaidByFirst(PipelineError):
-    """Rank 0 has failed and says why; the other processes only end."""
+class FirstProcessFailed(PipelineError):
+    """Rank 0 has failed and reports why; the other processes only end."""
 
 
 @dataclass(frozen=True)
-class World:
-    """This process among all of a training: its `rank` in 0..`size` - 1.
+class ProcessGroup:
+    """This process among all processes of a training: its `rank` in 0..`size` - 1.
 
-    Its methods are collective, but where said: every process calls them, in the same order.
+    Methods are collective unless they say otherwise: every process calls them in the same order.
     """
 
     rank: int = 0
@@ -46,7 +46,7 @@ class World:
 
     @classmethod
     def current(cls) -> Self:
-        """That of the process group, where there is one (`process_group`); else a single one."""
+        """The group that this process has joined with `process_group`; else a group of one."""
         if dist.is_available() and dist.is_initialized():
             return cls(dist.get_rank(), dist.get_world_size())
         return cls()
@@ -57,9 +57,10 @@ class World:
         return self.rank == 0
 
     def shared(self, work: Callable[[], Outcome]) -> Outcome:
-        """What `work` gives on rank 0, on every process; it is pickled on its way.
+        """What `work` returns on rank 0, on every process; it is pickled on its way.
 
-        What it raises is raised on rank 0, and `SaidByFirst` on the others, so that none waits.
+        What `work` raises is raised on rank 0, and `FirstProcessFailed` on the others, so that none
+        waits.
         """
         if self.size == 1:
             return work()
@@ -74,7 +75,7 @@ class World:
         if failure is not None:
             raise failure
         if sent[1] is not None:
-            raise SaidByFirst(sent[1])
+            raise FirstProcessFailed(sent[1])
         return sent[0]
 
     @contextmanager
@@ -124,7 +125,7 @@ class World:
         return stop
 
     def tensors(self, named: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """The tensors in memory that rank 0 calls with, on every process, sent one by one."""
+        """The tensors that rank 0 calls with, on every process, sent one by one."""
         if self.size == 1:
             return dict(named)
         shapes = self.shared(lambda: {name: value.to("meta") for name, value in named.items()})
@@ -133,23 +134,23 @@ class World:
         return received
 
     def spread(self, tensors: Iterable[Tensor]) -> None:
-        """Give each tensor the value it has on rank 0."""
+        """Set each tensor to the value it has on rank 0."""
         if self.size > 1:
             for tensor in tensors:
                 dist.broadcast(tensor, src=0)
 
 
 @contextmanager
-def process_group(device: str) -> Generator[World]:
-    """The world of a run of torchrun, from the environment; of a single process outside of one.
+def process_group(device: str) -> Generator[ProcessGroup]:
+    """Join the processes of a torchrun, as the environment describes it; else be one alone.
 
-    nccl between CUDA devices, gloo between CPUs and for what concerns no tensor. Within it one
-    process alone says what went wrong (`one_speaker`); the others end silently, with the exit code
-    of a stage (2, or 1 where it was stopped). Raises `ConfigError` where the environment is
+    Tensors travel by nccl between CUDA devices and by gloo between CPUs, everything else by gloo.
+    Within it one process reports an error (`one_reporter`); the others end silently, with the exit
+    code of a stage: 2, or 1 where it was stopped. Raises `ConfigError` where the environment is
     incomplete.
     """
     if int(os.environ.get("WORLD_SIZE", "1")) == 1:
-        yield World()
+        yield ProcessGroup()
         return
     missing = [name for name in FROM_TORCHRUN if name not in os.environ]
     if missing:
@@ -160,19 +161,19 @@ def process_group(device: str) -> Generator[World]:
         )
     store, rank, size = next(dist.rendezvous("env://", timeout=PATIENCE))
     store.set_timeout(PATIENCE)
-    met = dist.PrefixStore("group", store)
+    group_store = dist.PrefixStore("group", store)
     try:
-        with one_speaker(dist.PrefixStore("errors", store), rank):
+        with one_reporter(dist.PrefixStore("errors", store), rank):
             resolved = process_device(device)
             if resolved.type == "cuda":
                 torch.cuda.set_device(resolved)
             backend = "cpu:gloo,cuda:nccl" if resolved.type == "cuda" else "gloo"
             dist.init_process_group(
-                backend, store=met, rank=rank, world_size=size, timeout=PATIENCE
+                backend, store=group_store, rank=rank, world_size=size, timeout=PATIENCE
             )
-            yield World.current()
+            yield ProcessGroup.current()
     finally:
-        # Last, for it closes what the others may wait on: by then it is known who says why.
+        # Last: it closes what the others may wait on, and by then they know who reports.
         if dist.is_initialized():
             dist.destroy_process_group()
 
@@ -180,7 +181,7 @@ def process_group(device: str) -> Generator[World]:
 def process_device(name: str) -> torch.device:
     """The device of a `device:` param for this process.
 
-    Several processes on CUDA take the GPU of their LOCAL_RANK each. Raises `ConfigError` as
+    Of several processes on CUDA, each takes the GPU of its LOCAL_RANK. Raises `ConfigError` as
     `resolve_device` does, and where one GPU is named for several processes.
     """
     several = int(os.environ.get("WORLD_SIZE", "1")) > 1
@@ -195,39 +196,39 @@ def process_device(name: str) -> torch.device:
 
 
 @contextmanager
-def one_speaker(store: dist.Store, rank: int) -> Generator[None]:
-    """Within it, what the user can mend is raised on one process; the others exit with code 2.
+def one_reporter(store: dist.Store, rank: int) -> Generator[None]:
+    """Within it, an error of the user's kind is raised on one process; the others exit with 2.
 
-    That one is rank 0 where it fails too, else the first that fails, and its message names its
-    rank. A stop is said by rank 0, unless it is torchrun's, which ends all when one has failed.
-    `store` is what the processes met at: it needs no other process to answer.
+    Rank 0 reports where it fails too, else the first process that fails, with its rank in the
+    message. Rank 0 also reports a stop, unless torchrun stops all because one process failed.
+    `store` is the store of the rendezvous: it needs no other process to answer.
     """
     try:
         yield
-    except SaidByFirst:
+    except FirstProcessFailed:
         raise SystemExit(2) from None
     except (PipelineError, OSError) as error:
         if rank > 0:
             with suppress(RuntimeError, KeyboardInterrupt):
-                store.wait([_SPEAKER], PRECEDENCE)
-        # Where rank 0 held the store and is gone, an error is rather said twice than never.
+                store.wait([_REPORTER], PRECEDENCE)
+        # Where rank 0 held the store and is gone, better to report an error twice than never.
         with suppress(RuntimeError):
-            if store.compare_set(_SPEAKER, "", str(rank)) != str(rank).encode():
+            if store.compare_set(_REPORTER, "", str(rank)) != str(rank).encode():
                 raise SystemExit(2) from None
         if rank == 0:
             raise
         raise PipelineError(f"process of rank {rank}: {error}") from error
     except (KeyboardInterrupt, RuntimeError) as error:
-        # A RuntimeError is how gloo and NCCL say that another process is gone.
+        # gloo and NCCL raise a RuntimeError when another process is gone.
         stopped = isinstance(error, KeyboardInterrupt)
-        if (stopped and rank > 0) or _is_spoken(store):
+        if (stopped and rank > 0) or _is_reported(store):
             raise SystemExit(1 if stopped else 2) from None
         raise
 
 
-def _is_spoken(store: dist.Store) -> bool:
+def _is_reported(store: dist.Store) -> bool:
     try:
-        return store.check([_SPEAKER])
+        return store.check([_REPORTER])
     except RuntimeError:
         return False
 
@@ -236,9 +237,9 @@ def _is_spoken(store: dist.Store) -> bool:
 def deferred_interrupt() -> Generator[Callable[[], bool]]:
     """Within it, a first SIGINT or SIGTERM only sets what the yielded function returns.
 
-    A step stopped half-way would leave weights of which some are updated and others not; so the
-    loop asks between steps. A second signal raises `KeyboardInterrupt` at once. Outside the main
-    thread, where Python delivers no signal, it changes nothing.
+    A step stopped half-way would leave some weights updated and others not, so the loop asks
+    between steps. A second signal raises `KeyboardInterrupt` at once. Outside the main thread,
+    where Python delivers no signal, it changes nothing.
     """
     received: list[int] = []
     if threading.current_thread() is not threading.main_thread():

@@ -7,9 +7,8 @@ import torch
 from torch import Tensor, nn
 
 from pipeline.policy.diffusion import DiffusionActionExpert
-from pipeline.policy.expert import ActionExpert
+from pipeline.policy.expert import MOST_GAIN, ActionExpert, Guide, gain, pull
 from pipeline.policy.flow_matching import FlowMatchingActionExpert
-from pipeline.policy.guidance import MOST_GAIN, Guide, gain, pull
 
 HORIZON, KEPT, COUNT = 12, 5, 2000
 STEP = torch.arange(HORIZON, dtype=torch.float64)

@@ -1,0 +1,454 @@
+"""A policy drives the simulated insertion closed loop, in this process or over the wire.
+
+One loop (`_Driver.drive`) steps several environments together; two drivers differ in who answers
+with chunks. The same seeds give the same figures, bit for bit on one machine.
+"""
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Final, Generic, TypeVar
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from tqdm import tqdm
+
+from pipeline.base.commands import command
+from pipeline.base.config import Level, RolloutAblation, RolloutParams
+from pipeline.base.errors import CheckpointMismatch, ConfigError
+from pipeline.evaluate.rollouts import (
+    EXPERT,
+    POLICY,
+    RolloutEpisode,
+    Rollouts,
+    SuccessRate,
+    controller_name,
+)
+from pipeline.policy.checkpoint import PolicyCheckpoint
+from pipeline.policy.observation import moving_channels, stream_of
+from pipeline.policy.policy import Policy
+from pipeline.robot.chunking import Executor, check_chunking
+from pipeline.robot.client import PolicyClient
+from pipeline.robot.live_features import LiveFeatures, prove
+from pipeline.robot.loop import ControlLoop, SafeStop
+from pipeline.robot.robot_memory import RobotMemory, SeenFeatures
+from pipeline.robot.session import stack_guides
+from pipeline.simulation.environment import InsertionEnvironment
+from pipeline.simulation.insertion import INSERTED, TICK_HZ, NeedleInsertion
+from pipeline.simulation.insertion_formats import INSTRUCTION
+from pipeline.simulation.rendering import VIEWS, photograph
+
+SIDE_BY_SIDE: Final = 50
+"""Environments that are stepped together and share passes of a model in this process."""
+
+Chunk = NDArray[np.float32]
+Readings = Mapping[str, NDArray[Any]]
+
+
+def roll_out(
+    checkpoint: PolicyCheckpoint,
+    name: str,
+    policy: Policy,
+    load_features: Callable[[], LiveFeatures],
+    wanted: RolloutParams,
+    say: Callable[[str], None] = lambda line: None,
+) -> Rollouts:
+    """Episodes of the policy, of the policy with a stream ablated, and of the demonstrator.
+
+    `say` prints a line for each controller whose episodes have ended. `load_features` is called
+    where the policy looks at features, after everything else was checked; the model proves that it
+    gives the policy's features before the first episode (`prove`). Raises `CheckpointMismatch`
+    where the phantom lacks what the policy was trained on, and `ConfigError` for an instruction
+    that the policy was not trained on, for chunking that its expert cannot do and for more steps
+    than a chunk has.
+    """
+    shape = checkpoint.shape
+    widths = {"action": shape.action_dim, "state": shape.state_dim, "sensor": shape.sensor_channels}
+    _refuse_other_robot(checkpoint.source, widths)
+    check_chunking(wanted.chunking, policy.stochastic)
+    Executor(wanted.chunking, wanted.execute, policy.params.horizon)
+    features = load_features() if "features" in policy.encoders else None
+    if features is not None:
+        prove(checkpoint, features, say)
+    instruction = _instruction_of(checkpoint.instructions)
+    alone = len(policy.encoders) == 1
+    ablations: list[RolloutAblation] = [
+        name
+        for name in dict.fromkeys(wanted.ablations)
+        if name.split()[0] in policy.encoders and not (alone and name.endswith("off"))
+    ]
+    settings = {"checkpoint": name, "step": checkpoint.step}
+    settings |= {"model_type": policy.params.model_type, "instruction": instruction}
+    driver = _LocalDriver(checkpoint, policy, features, wanted, instruction)
+    return _run_episodes(driver, checkpoint.source, [None, *ablations], wanted, settings, say)
+
+
+def roll_out_served(
+    server: PolicyClient, wanted: RolloutParams, say: Callable[[str], None] = lambda line: None
+) -> Rollouts:
+    """Episodes of a served policy, one after another, and of the demonstrator.
+
+    The simulation waits for each answer: with `rollout.execute` 1 a policy does what it does in
+    `roll_out` without latency, bit for bit where both compute one row at a time on one thread.
+    No stream is ablated. Raises as `roll_out`, and `ConfigError` for a simulated latency.
+    """
+    if wanted.latency_ms:
+        raise ConfigError(
+            "rollout.latency_ms: expected 0 with rollout.server, whose answers are waited for, "
+            f"found {wanted.latency_ms:g}. Roll out without rollout.server to simulate it."
+        )
+    metadata = server.metadata
+    streams = {name: metadata["streams"].get(name) for name in ("action", "state", "sensor")}
+    widths = {name: len(stream["names"]) if stream else 0 for name, stream in streams.items()}
+    _refuse_other_robot(metadata, widths)
+    check_chunking(wanted.chunking, metadata["stochastic"])
+    instruction = _instruction_of(metadata["instructions"])
+    settings = {name: metadata[name] for name in ("checkpoint", "step", "model_type")}
+    settings["instruction"] = instruction
+    driver = _ServedDriver(server, wanted, instruction)
+    return _run_episodes(driver, metadata, [None], wanted, settings, say)
+
+
+def _refuse_other_robot(source: Mapping[str, Any], widths: Mapping[str, int]) -> None:
+    """Raise `CheckpointMismatch` where the phantom lacks what a policy was trained on.
+
+    `source` has `streams` and `action_hz`; `widths` are those of action, state and sensor, 0 of a
+    stream that the policy does not look at.
+    """
+    streams, hz = source["streams"], source["action_hz"]
+    kind, own = streams["action"]["kind"], {"action": (7,), "state": (0, 12), "sensor": (0, 1026)}
+    fits = all(widths[name] in known for name, known in own.items())
+    if not (fits and kind == "delta" and hz == TICK_HZ and set(streams["views"]) <= set(VIEWS)):
+        channels = ", ".join(f"{name} channels {width}" for name, width in widths.items())
+        raise CheckpointMismatch(
+            "rollout.environment: the policy was trained on another robot than the phantom: views "
+            f"{', '.join(streams['views'])}, action {kind}, {channels}, action_hz {hz}, of the "
+            f"phantom views {', '.join(VIEWS)}, action delta, action channels 7, state channels "
+            f"12, sensor channels 1026, action_hz {TICK_HZ}. Judge it on its own recordings "
+            f"({command('evaluate')}) and set rollout.environment to null, which leaves "
+            "rollouts out of dvc repro."
+        )
+
+
+def _instruction_of(trained: Sequence[str]) -> str:
+    """The instruction for the robot: the phantom's task, or the only one of the training.
+
+    Raises `ConfigError` where the policy was trained on several others.
+    """
+    if not trained or INSTRUCTION in trained:
+        return INSTRUCTION
+    if len(trained) == 1:
+        return trained[0]
+    raise ConfigError(
+        f"rollout: the policy was trained on other instructions than {INSTRUCTION!r}: "
+        f"{', '.join(map(repr, trained))}. Train it on the phantom's, or on one: "
+        "data.sources[].instruction"
+    )
+
+
+def _run_episodes(
+    driver: "_Driver[Any]",
+    source: Mapping[str, Any],
+    ablations: Sequence[RolloutAblation | None],
+    wanted: RolloutParams,
+    settings: Mapping[str, Any],
+    say: Callable[[str], None],
+) -> Rollouts:
+    """Episodes of the policy under each of `ablations`, None for none, and of the demonstrator.
+
+    `source` is what the policy was trained on; `settings` describe it, its `checkpoint` among them.
+    """
+    seeds = range(wanted.seed, wanted.seed + wanted.episodes)
+    side_by_side = driver.side_by_side
+    groups = [seeds[at : at + side_by_side] for at in range(0, len(seeds), side_by_side)]
+    episodes: list[RolloutEpisode] = []
+    total = (1 + len(ablations)) * len(seeds)
+    with tqdm(total=total, unit="episode", disable=None) as bar:
+        for ablation in ablations:
+            controller = ablation or POLICY
+            bar.set_description(controller)
+            for group in groups:
+                environments = [_begin_episode(source, wanted.level, seed) for seed in group]
+                stops = driver.drive(environments, ablation, bar.update)
+                episodes += [
+                    _episode(controller, wanted.level, environment.insertion, stop)
+                    for environment, stop in zip(environments, stops, strict=True)
+                ]
+            rate = SuccessRate.of([e.success for e in episodes if e.controller == controller])
+            say(f"{controller_name(controller)}: {rate} of {rate.episodes} episodes")
+        bar.set_description(EXPERT)
+        for seed in seeds:
+            insertion = _begin_episode(source, wanted.level, seed).insertion
+            while not insertion.finished:
+                insertion.step(insertion.expert_action())
+            episodes.append(_episode(EXPERT, wanted.level, insertion, None))
+            bar.update()
+    params = wanted.model_dump(mode="json", exclude={"checkpoint", "output", "device"})
+    return Rollouts(settings["checkpoint"], params | dict(settings), tuple(episodes))
+
+
+def _begin_episode(source: Mapping[str, Any], level: Level, seed: int) -> InsertionEnvironment:
+    """The phantom at the beginning of an episode, with actions as in a policy's `source`."""
+    rotation = "rotvec" if "rx" in source["streams"]["action"]["names"] else "euler_delta"
+    environment = InsertionEnvironment(level, rotation, cameras=False)
+    environment.reset(seed=seed)
+    return environment
+
+
+def _episode(
+    controller: str, level: str, insertion: NeedleInsertion, stop: str | None
+) -> RolloutEpisode:
+    """The record of an episode that has ended, by its outcome or by a safe stop."""
+    progress, trace = insertion.progress, insertion.trace()
+    reason = stop or str(insertion.outcome)
+    return RolloutEpisode(
+        controller=controller,
+        seed=insertion.layout.seed,
+        level=level,
+        success=reason == INSERTED,
+        reason=reason,
+        lateral_mm=float(np.hypot(*trace.lateral_mm)),
+        depth_mm=float(trace.layer_mm[-1]),
+        overshoot_mm=progress.overshoot_mm,
+        max_force_n=progress.max_force_n,
+        time_s=insertion.time_s,
+        ticks=len(trace.time_s),
+        trace=trace,
+        frames=lambda time_s: {view: photograph(view, insertion, time_s) for view in VIEWS},
+    )
+
+
+@dataclass
+class _Robot(ABC):
+    """One environment with its control loop, and why it stopped safely."""
+
+    environment: InsertionEnvironment
+    loop: ControlLoop
+    stop: str | None = field(default=None, init=False)
+
+    @abstractmethod
+    def sense(self, readings: Readings) -> None:
+        """Begin a tick with what was read since the last."""
+
+    def plan(self, chunk: Chunk) -> None:
+        """Take the chunk that was asked for; one that is not all numbers stops the robot."""
+        try:
+            self.loop.plan(chunk)
+        except SafeStop as stop:
+            self.stop = f"safe stop: {stop}"
+
+    def step(self) -> None:
+        """Act for one tick; stand still until the first chunk is there."""
+        action = self.loop.action()
+        still = np.zeros(self.environment.action_space.shape or ())
+        self.sense(self.environment.step(still if action is None else action)[0])
+
+    @property
+    def active(self) -> bool:
+        """Whether the episode goes on."""
+        return self.stop is None and not self.environment.insertion.finished
+
+
+AnyRobot = TypeVar("AnyRobot", bound=_Robot)
+
+
+class _Driver(ABC, Generic[AnyRobot]):
+    """Runs a policy on robots to the ends of their episodes."""
+
+    side_by_side: int
+    """Robots that it drives together, at most."""
+
+    def drive(
+        self,
+        environments: Sequence[InsertionEnvironment],
+        ablation: RolloutAblation | None,
+        ended: Callable[[], Any],
+    ) -> list[str | None]:
+        """Why each robot stopped safely, or None; `ended` is called for each that ends."""
+        robots = [self.begin(environment) for environment in environments]
+        for robot in robots:
+            robot.sense(robot.environment.readings())
+        active = robots
+        while active:
+            for robot, chunk in self.chunks(active, ablation):
+                robot.plan(chunk)
+            for robot in active:
+                if robot.stop is None:
+                    robot.step()
+            going = [robot for robot in active if robot.active]
+            for _ in range(len(active) - len(going)):
+                ended()
+            active = going
+        return [robot.stop for robot in robots]
+
+    @abstractmethod
+    def begin(self, environment: InsertionEnvironment) -> AnyRobot:
+        """The robot of an environment whose episode begins."""
+
+    @abstractmethod
+    def chunks(
+        self, active: Sequence[AnyRobot], ablation: RolloutAblation | None
+    ) -> Iterable[tuple[AnyRobot, Chunk]]:
+        """The robots whose chunk is due in this tick, each with its chunk (horizon, action)."""
+
+
+@dataclass
+class _LocalRobot(_Robot):
+    """A robot whose memory is here; its noise comes from a generator of its own."""
+
+    memory: RobotMemory
+    generator: torch.Generator
+    under_way: tuple[float, SeenFeatures] | None = None
+    """When the model's pass that has begun ends, and what it gives."""
+    first: dict[str, NDArray[Any]] = field(default_factory=dict[str, NDArray[Any]])
+    """What a frozen stream was first."""
+
+    def sense(self, readings: Readings) -> None:
+        """Begin a tick; features whose pass has ended by now become the newest."""
+        self.loop.begin_tick()
+        self.memory.sense(readings)
+        self._take_features()
+
+    def see(self, seen: SeenFeatures, latency_s: float) -> None:
+        """Begin a pass of the model, whose answer is there `latency_s` from now."""
+        self.loop.pass_began()
+        self.under_way = self.memory.time_s + latency_s, seen
+        self._take_features()
+
+    def _take_features(self) -> None:
+        if self.under_way is not None and self.memory.time_s >= self.under_way[0] - 1e-9:
+            self.memory.features, self.under_way = self.under_way[1], None
+            self.loop.pass_ended()
+
+
+@dataclass(frozen=True)
+class _LocalDriver(_Driver[_LocalRobot]):
+    """Drives by a policy in this process; `features` is the model, None where it needs none.
+
+    A robot draws from a generator of its own seed, so that it does as it would alone.
+    """
+
+    side_by_side = SIDE_BY_SIDE
+    checkpoint: PolicyCheckpoint
+    policy: Policy
+    features: LiveFeatures | None
+    wanted: RolloutParams
+    instruction: str
+
+    def begin(self, environment: InsertionEnvironment) -> _LocalRobot:
+        """The loop and the memory of a robot."""
+        wanted, source = self.wanted, self.checkpoint.source
+        moving = moving_channels(source["streams"]["action"])
+        executor = Executor(wanted.chunking, wanted.execute, self.policy.params.horizon, moving)
+        loop = ControlLoop(executor, source["vlm_reuse_count"], self.features is not None)
+        generator = torch.Generator().manual_seed(environment.insertion.layout.seed)
+        return _LocalRobot(environment, loop, RobotMemory.of(self.policy), generator)
+
+    def chunks(
+        self, active: Sequence[_LocalRobot], ablation: RolloutAblation | None
+    ) -> Iterable[tuple[_LocalRobot, Chunk]]:
+        """One pass of the model for all whose frames are due, one of the head for all chunks."""
+        self._look([robot for robot in active if robot.loop.frames_due])
+        due = [
+            robot
+            for robot in active
+            if robot.loop.chunk_due and (self.features is None or robot.memory.features is not None)
+        ]
+        return zip(due, self._act(due, ablation), strict=True) if due else ()
+
+    def _look(self, due: Sequence[_LocalRobot]) -> None:
+        if not due or self.features is None:
+            return
+        trained = self.checkpoint.source["streams"]["views"]
+        shots = [robot.environment.frames() for robot in due]
+        taken = [{view: views[view] for view in trained} for views in shots]
+        frames = [{view: frame for view, (_, frame) in views.items()} for views in taken]
+        features, valid = self.features(frames, self.instruction)
+        rows = zip(features.numpy(), valid.numpy(), strict=True)
+        for robot, views, (row, real) in zip(due, taken, rows, strict=True):
+            times = np.array([time for time, _ in views.values()])
+            robot.see(SeenFeatures(row, real, times), self.wanted.latency_ms / 1000)
+
+    def _act(self, due: Sequence[_LocalRobot], ablation: RolloutAblation | None) -> Chunk:
+        """The chunks (robot, horizon, action).
+
+        A stream that is off keeps its true ages and gaps; one that is frozen stays all as it was
+        first.
+        """
+        guides = [robot.loop.ask() for robot in due]
+        fields = [robot.memory.observation() for robot in due]
+        if ablation is not None:
+            name, how = ablation.split()
+            mean = self.checkpoint.typical(name).astype(np.float32)
+            for robot, own in zip(due, fields, strict=True):
+                if how == "off":
+                    own[name] = np.broadcast_to(mean, own[name].shape)
+                else:
+                    now = {key: value for key, value in own.items() if stream_of(key) == name}
+                    robot.first = robot.first or now
+                    own |= robot.first
+        streams = {name: np.stack([own[name] for own in fields]) for name in fields[0]}
+        observation = self.policy.observe(streams)
+        guide = stack_guides(guides, observation.features.device)
+        generators = [robot.generator for robot in due]
+        return self.policy.act(observation, generators, guide).cpu().numpy()
+
+
+@dataclass
+class _ServedRobot(_Robot):
+    """A robot whose memory is the server's."""
+
+    unsent: list[Readings] = field(default_factory=list[Readings])
+    """The readings of each tick since the last observation."""
+
+    def sense(self, readings: Readings) -> None:
+        """Begin a tick; its readings go out with the next observation."""
+        self.loop.begin_tick()
+        self.unsent.append(readings)
+
+
+@dataclass(frozen=True)
+class _ServedDriver(_Driver[_ServedRobot]):
+    """Drives by a policy server, whose connection is the memory of one robot."""
+
+    side_by_side = 1
+    server: PolicyClient
+    wanted: RolloutParams
+    instruction: str
+
+    def begin(self, environment: InsertionEnvironment) -> _ServedRobot:
+        """The loop of a robot; the server begins anew with its first observation."""
+        wanted, metadata = self.wanted, self.server.metadata
+        executor = Executor(
+            wanted.chunking, wanted.execute, metadata["horizon"], metadata["moving"]
+        )
+        loop = ControlLoop(executor, metadata["vlm_reuse_count"], metadata["uses_features"])
+        self.server.reset(environment.insertion.layout.seed)
+        return _ServedRobot(environment, loop)
+
+    def chunks(
+        self, active: Sequence[_ServedRobot], ablation: RolloutAblation | None
+    ) -> Iterable[tuple[_ServedRobot, Chunk]]:
+        """The server's answers, each waited for."""
+        assert ablation is None, "a served policy sees what there is"
+        return [(robot, self._ask(robot)) for robot in active if robot.loop.chunk_due]
+
+    def _ask(self, robot: _ServedRobot) -> Chunk:
+        guide = robot.loop.ask()
+        observation: dict[str, Any] = {
+            name: np.concatenate([tick[name] for tick in robot.unsent]) for name in robot.unsent[0]
+        }
+        observation |= {"time": robot.unsent[-1]["time"], "prompt": self.instruction}
+        if guide is not None:
+            observation |= {"guide/chunk": guide.chunk, "guide/weight": guide.weight}
+        if robot.loop.frames_due:
+            robot.loop.pass_began()
+            frames = robot.environment.frames()
+            for view in self.server.metadata["streams"]["views"]:
+                time_s, frame = frames[view]
+                observation |= {f"images/{view}": frame, f"images_time/{view}": time_s}
+        answer = self.server.infer(observation)
+        robot.loop.pass_ended()
+        robot.unsent = []
+        return answer["actions"]
