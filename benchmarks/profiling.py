@@ -19,7 +19,7 @@ from pipeline.vlm.extractor import Extractor
 from pipeline.vlm.vision import VisionTower
 
 _STEPS: tuple[tuple[str, Any, str], ...] = (
-    ("key", "pipeline.extract.engine", "row_key"),
+    ("key", "pipeline.extract.rows", "row_key"),
     ("resize", "pipeline.vlm.preparation", "stretch"),
     ("collate", Extractor, "collate"),
     ("patchify", "pipeline.vlm.extractor", "patchify"),

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from pipeline.base.bfloat16 import array_of
 from pipeline.base.errors import NumericsError, VLMError
-from pipeline.extract.engine import ReadyRow
+from pipeline.extract.rows import ReadyRow
 from pipeline.vlm.preparation import TokenLayout
 from pipeline.vlm.qwen import FrozenVLM, Pending
 

@@ -6,8 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.base.golden import spread
-from pipeline.extract.engine import RowFrames, row_frames
+from pipeline.data.row_range import RowFrames
 from pipeline.extract.plan import Say, StorePlaces
+from pipeline.extract.rows import row_frames
 from pipeline.extract.survey import Survey
 from pipeline.store import GoldenFrames, StoreBuild
 from pipeline.store.golden import carried_golden

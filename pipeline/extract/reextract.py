@@ -19,12 +19,11 @@ from pipeline.base.errors import StoreMismatch
 from pipeline.base.format import capped
 from pipeline.data.row_range import RowFrames
 from pipeline.extract.encoder import Encoder
-from pipeline.extract.engine import ReadyRow, RowPreparation
+from pipeline.extract.rows import ReadyRow, RowPreparation
 from pipeline.extract.survey import survey
 from pipeline.store import FEATURES, FeatureStore
 from pipeline.store.writer import environment_runs
 from pipeline.vlm.deviation import slot_deviations, tolerance_of
-from pipeline.vlm.preparation import Preparer
 from pipeline.vlm.qwen import FrozenVLM
 
 
@@ -126,7 +125,7 @@ def reextract(path: Path, params: Params, say: Callable[[str], None]) -> Reextra
     recordings = {episode.index: today[episode.digest] for episode in known}
     vl_start, frame_time = (store.array(name) for name in ("episode/vl_start", "vl/frame_time"))
     frames = RowFrames(recordings, vl_start, frame_time, spec.views)
-    preparation = RowPreparation(Preparer(params.vlm, spec), spec, ())
+    preparation = RowPreparation(surveyed, ())
     prepared = (row for part in frames.ranges(rows) for row in preparation.prepare(part))
     ready = (row for row in prepared if isinstance(row, ReadyRow))  # all: no other store is known
     encoder = Encoder(vlm, params.extract.batch_size, spec.variants)
