@@ -1,9 +1,9 @@
-"""Which episodes there are and what they are, and whether each can be used.
+"""Which episodes there are, what they hold, and whether each can be used.
 
-A survey reads no sensor and decodes no frame. Its plan digest names everything that decides what a
-store holds: where a finished store carries the same, there is nothing to do. `check_episodes` then
-reads every episode whole, before the first byte is written, so that all that is wrong is said at
-once and before anything expensive runs.
+A survey reads no sensor and decodes no frame. Its plan digest covers everything that decides what a
+store holds: where a finished store has the same, there is nothing to do. `check_episodes` then
+reads every episode whole, before the first byte is written, so that everything that is wrong is
+listed at once, before anything expensive runs.
 """
 
 import os
@@ -34,18 +34,19 @@ _STORED = Border(
     RecordingError,
     "No store could be read with it: rename or shorten it there, or leave the episode out.",
 )
-"""How what a store is to say of an episode is refused, by the models that will read it."""
+"""Refuses an episode whose texts the readers of a store would refuse."""
 
 MOST_EPISODES = 10
-"""That cannot be used and are shown; the rest is counted."""
+"""How many unusable episodes a message lists; the rest is counted."""
 
 
 @dataclass(frozen=True)
 class SurveyedEpisode:
-    """A recording and what the store says of it, its digests too."""
+    """A recording, and the texts that the store keeps of it, its digests among them."""
 
     recording: Recording
     text: Mapping[str, str]
+    views: tuple[str, ...]
 
     @property
     def content(self) -> str:
@@ -54,16 +55,16 @@ class SurveyedEpisode:
 
     @property
     def digest(self) -> str:
-        """Digest of content and of everything else that decides what the store says of it."""
+        """Digest of content and of everything else that decides its part of the store."""
         return self.text["digest"]
 
 
 @dataclass(frozen=True)
 class Survey:
-    """What is to be in the store.
+    """What the store is to hold.
 
-    A data set's metadata list the `missing`, which are not among its files. `plan` is the digest of
-    all that decides what the store holds.
+    `missing` names episodes that a data set's metadata list and its files lack. `plan` is the
+    digest of everything that decides what the store holds.
     """
 
     params: Params
@@ -92,7 +93,7 @@ class Survey:
 
 @dataclass(frozen=True)
 class CheckedEpisode(EpisodeRows):
-    """An episode that was read whole and found sound; its streams are let go again."""
+    """An episode that was read whole and is sound; its streams are let go again."""
 
     recording: Recording
     embodiment: Embodiment
@@ -104,23 +105,34 @@ def survey(params: Params, digests: ContentDigests) -> Survey:
     With `data.on_bad_episode: skip`, episodes that an earlier check found bad are left out. Raises
     `RecordingError` when no episode is usable, and whatever a source as a whole is refused for.
     """
-    data, extract = params.data, params.extract
+    data = params.data
     opened = open_recordings(data.sources, data.root, data.views)
     rotation = choose_action_rotation(data.action_rotation, opened.recordings)
-    episodes: list[SurveyedEpisode] = []
-    bad = list(opened.bad)
-    views: set[str] = set()
+    episodes, bad = list[SurveyedEpisode](), list(opened.bad)
     for recording in tqdm(opened.recordings, "survey", unit="episode", disable=None, leave=False):
         try:
             episode = _surveyed(recording, data, rotation, digests)
             if data.on_bad_episode == "skip" and (reason := digests.bad(episode.digest)):
                 raise RecordingError(reason)
-            views |= set(recording.view_names())
             episodes.append(episode)
         except RecordingError as error:
             bad.append(BadEpisode(recording.source, recording.path, str(error)))
     if not episodes:
         _refuse_bad(bad, of=len(bad))
+    return _planned(params, episodes, opened.missing, bad, rotation, digests)
+
+
+def _planned(
+    params: Params,
+    episodes: Sequence[SurveyedEpisode],
+    missing: Sequence[str],
+    bad: Sequence[BadEpisode],
+    rotation: ActionRotation,
+    digests: ContentDigests,
+) -> Survey:
+    """The survey of these episodes, which alone decide the views."""
+    data, extract = params.data, params.extract
+    views = {view for episode in episodes for view in episode.views}
     spec = feature_spec(params.vlm, extract.dtype, sorted(views), digests.of, digests.text)
     plan = joint_digest(
         spec.digest,
@@ -129,27 +141,30 @@ def survey(params: Params, digests: ContentDigests) -> Survey:
         repr([(source.name, source.action_kind) for source in data.sources]),
         *(episode.digest for episode in episodes),
     )
-    return Survey(params, tuple(episodes), opened.missing, tuple(bad), spec, rotation, plan)
+    return Survey(params, tuple(episodes), tuple(missing), tuple(bad), spec, rotation, plan)
 
 
 def sound_episodes(
     surveyed: Survey, digests: ContentDigests
 ) -> tuple[Survey, list[CheckedEpisode]]:
-    """Every sound episode; the survey again without those that have to be skipped.
+    """Every sound episode, and the survey without those that have to be skipped.
 
-    A bad episode must decide neither the views nor how actions are derived. Raises as
-    `check_episodes` does.
+    Raises as `check_episodes` does.
     """
-    checked, bad = check_episodes(surveyed)
-    if not bad:
+    checked, failed = check_episodes(surveyed)
+    if not failed:
         return surveyed, checked
-    for episode, reason in bad:
+    bad = list(surveyed.bad)
+    for episode, reason in failed:
         digests.note_bad(episode.digest, reason)
-    again = survey(surveyed.params, digests)
-    if again.action_rotation == surveyed.action_rotation:
-        kept = {episode.digest for episode in again.episodes}
-        return again, [episode for episode in checked if episode.said["digest"] in kept]
-    return sound_episodes(again, digests)
+        bad.append(BadEpisode(episode.recording.source, episode.recording.path, reason))
+    unusable = {episode.digest for episode, _ in failed}
+    sound = [episode for episode in surveyed.episodes if episode.digest not in unusable]
+    again = _planned(
+        surveyed.params, sound, surveyed.missing, bad, surveyed.action_rotation, digests
+    )
+    kept = {episode.digest for episode in sound}
+    return again, [episode for episode in checked if episode.said["digest"] in kept]
 
 
 def check_episodes(
@@ -253,7 +268,7 @@ def _surveyed(
         "path": path.as_posix(),
         "format": recording.format,
         "instruction": recording.instruction,
-        "content": content_digest(recording, digests.of),
+        "content": _content(recording, digests),
     }
     group = recording.group
     said = [text["id"], text["format"], text["instruction"], text["path"]]
@@ -262,4 +277,28 @@ def _surveyed(
         text["group"] = group
     decides = repr((data.action_hz, data.vlm_reuse_count, rotation))
     digest = joint_digest(text["content"], recording.source, *said, decides)
-    return SurveyedEpisode(recording, text | {"digest": digest})
+    return SurveyedEpisode(recording, text | {"digest": digest}, tuple(recording.view_names()))
+
+
+_CONTENT_VERSION = 1
+"""To be raised whenever `content_digest` changes: results of before are remembered."""
+
+
+def _content(recording: Recording, digests: ContentDigests) -> str:
+    """The content digest of a recording, remembered by path, size and mtime of all its files.
+
+    One entry an episode: to look up each of its files would take longer than their `stat`.
+    """
+    listed = [str(_CONTENT_VERSION), recording.identity(), str(recording.path)]
+    real: dict[str, str] = {}
+    try:
+        for file in map(str, recording.files()):
+            status = os.stat(file)  # noqa: PTH116, a tenth of the time of a path's
+            folder, _, name = file.rpartition("/")
+            if folder not in real:
+                real[folder] = os.path.realpath(folder)
+            what = f"{status.st_mode} {status.st_size} {status.st_mtime_ns}"
+            listed.append(f"{what} {real[folder]}/{name}")
+    except OSError:
+        return content_digest(recording, digests.of)  # which names the file
+    return digests.text(joint_digest(*listed), lambda: content_digest(recording, digests.of))
