@@ -1,9 +1,8 @@
 """The executor on dask workers: they write ranges of rows, this process marks what was written.
 
-Dask tries again what failed, and what a worker had when it died. What it gives up is computed at
-the end, one episode at a time while nothing else is, so that no recording is blamed for another.
-Each worker process holds one model. Its threads take turns with it: while one encodes, the others
-prepare.
+Dask repeats tasks that failed or whose worker died. Those that it gives up are computed at the end,
+one episode at a time, so that no recording is blamed for another. Each worker process holds one
+model, with which its threads take turns: while one encodes, the others prepare.
 """
 
 import math
@@ -66,11 +65,10 @@ _AUTO_RANGE_ROWS = 32
 # Tasks that the scheduler holds: enough for hundreds of workers, never millions.
 _TASKS_AHEAD = 1000
 
-# So many workers dead, each with a task that dask gave up, before a row is written are no
-# recording's fault.
+# When so many workers have died before any row was written, no recording is to blame.
 _HOPELESS_DEATHS = 4
 
-# For processes of this machine to come back after a death, however long their imports take.
+# Time for local processes to come back after a death, however long their imports take.
 _LOCAL_PATIENCE = {
     "distributed.deploy.lost-worker-timeout": "1h",
     "distributed.scheduler.no-workers-timeout": "120s",
@@ -81,7 +79,7 @@ _LOOK_EVERY_S = 0.05
 
 # Rows that one task computes, ascending.
 Range = NDArray[np.int64]
-# Of a task: what it returned, or in its place an exception.
+# What a task returned, or the exception that it raised.
 Result = Any
 
 
@@ -299,7 +297,7 @@ class ClusterTasks:
             yield done
 
     def _raise_unless_recording(self, error: Exception) -> None:
-        """Raise what the recordings of a range cannot be to blame for."""
+        """Raise an error that no recording can be blamed for."""
         if isinstance(error, CancelledError):
             raise PipelineError(
                 f"the connection to the dask scheduler was lost ({error}). What was written is "
@@ -322,7 +320,7 @@ class ClusterTasks:
             )
 
     def _reason(self, episode: int, rows: Range, error: Exception) -> str:
-        """Why the rows of an episode could not be computed, alone."""
+        """Why the rows of an episode could not be computed even alone."""
         self._raise_unless_recording(error)
         if isinstance(error, KilledWorker):
             deaths = 1 + error.allowed_failures
@@ -333,18 +331,18 @@ class ClusterTasks:
 
 
 def rows_between_pages(row_bytes: int) -> int:
-    """Every how many rows one begins where a page of its file begins.
+    """The least number of rows that fills whole pages of a file.
 
-    Divides every chunk: chunks are multiples of 4,096 rows.
+    It divides every chunk: chunks are multiples of 4,096 rows.
     """
     return PAGE_BYTES // math.gcd(row_bytes, PAGE_BYTES)
 
 
 def ranges_of(missing: Range, most: int, chunk_rows: int, together: int = 1) -> list[Range]:
-    """Rows (ascending, of `missing`) that each task computes: as many as `most`, or a few more.
+    """The ranges of `missing` (ascending) that tasks compute: `most` rows each, or a few more.
 
-    A range lies within one chunk. Blocks of `together` rows, which divide a chunk, are never cut,
-    for hosts must not share a page.
+    A range lies within one chunk. Blocks of `together` rows, which divide a chunk, are never cut:
+    hosts must not share a page.
     """
     chunk, block = missing // chunk_rows, missing // together
     begin = np.searchsorted(block, block) - np.searchsorted(chunk, chunk)
@@ -404,11 +402,10 @@ def connected(extract: ExtractParams) -> Generator[Client]:
 
 @contextmanager
 def _local_cluster(workers: int, extract: ExtractParams) -> Generator[LocalCluster]:
-    """Worker processes of this host, all of them up; raises `PipelineError` where they cannot be.
+    """Worker processes of this host; raises `PipelineError` where they cannot be started.
 
-    One thread of each has the model, the others prepare. Dask cannot be interrupted while they
-    start without noise and orphans, so a thread starts them and an interrupted coordinator kills
-    what was begun: then that thread ends by itself.
+    Interrupting dask while they start leaves noise and orphans. So a thread starts them, and an
+    interrupted coordinator kills the processes, upon which that thread ends by itself.
     """
     cores = len(os.sched_getaffinity(0))
     threads = os.environ.get("OMP_NUM_THREADS") or str(max(1, cores // workers))

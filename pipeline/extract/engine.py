@@ -22,7 +22,6 @@ from tqdm import tqdm
 
 from pipeline.base.digests import ContentDigests
 from pipeline.data.row_range import RowFrames, by_episode
-from pipeline.extract.plan import rate_name
 from pipeline.extract.rows import (
     FeatureBlock,
     KnownRow,
@@ -116,7 +115,7 @@ def fill(
         missing = np.setdiff1d(missing, taken)
         speed = executor(surveyed, known, frames, missing, marks) if len(missing) else Speed()
     if speed.rows_per_s is not None:
-        digests.note_rate(rate_name(surveyed), speed.rows_per_s)
+        digests.note_rate(surveyed.rate_name, speed.rows_per_s)
     return ExtractionReport(
         store=build.target,
         rows=total,

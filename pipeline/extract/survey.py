@@ -6,10 +6,11 @@ reads every episode whole, before the first byte is written, so that everything 
 listed at once, before anything expensive runs.
 """
 
+import json
 import os
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -35,6 +36,8 @@ _STORED = Border(
     "No store could be read with it: rename or shorten it there, or leave the episode out.",
 )
 """Refuses an episode whose texts the readers of a store would refuse."""
+
+_DECIDES_SPEED = ("weights", "adapter", "processor", "compute_dtype", "variants")
 
 MOST_EPISODES = 10
 """How many unusable episodes a message lists; the rest is counted."""
@@ -90,6 +93,17 @@ class Survey:
         """The content digests of the episodes."""
         return {episode.content for episode in self.episodes}
 
+    @property
+    def rate_name(self) -> str:
+        """The name under which the speed of this model on these devices is remembered.
+
+        What else differs between specs, such as prompt, slots or names of views, costs little.
+        """
+        extract, spec = self.params.extract, self.spec.attrs()
+        by = f" on {extract.workers}" if extract.workers != 0 else ""
+        alike = {name: spec.get(name) for name in _DECIDES_SPEED} | {"views": len(spec["views"])}
+        return f"{joint_digest(json.dumps(alike, sort_keys=True))} {extract.device}{by}"
+
 
 @dataclass(frozen=True)
 class CheckedEpisode(EpisodeRows):
@@ -119,29 +133,24 @@ def survey(params: Params, digests: ContentDigests) -> Survey:
             bad.append(BadEpisode(recording.source, recording.path, str(error)))
     if not episodes:
         _refuse_bad(bad, of=len(bad))
-    return _planned(params, episodes, opened.missing, bad, rotation, digests)
+    spec, plan = _spec_and_plan(params, episodes, digests)
+    return Survey(params, tuple(episodes), opened.missing, tuple(bad), spec, rotation, plan)
 
 
-def _planned(
-    params: Params,
-    episodes: Sequence[SurveyedEpisode],
-    missing: Sequence[str],
-    bad: Sequence[BadEpisode],
-    rotation: ActionRotation,
-    digests: ContentDigests,
-) -> Survey:
-    """The survey of these episodes, which alone decide the views."""
+def _spec_and_plan(
+    params: Params, episodes: Sequence[SurveyedEpisode], digests: ContentDigests
+) -> tuple[FeatureSpec, str]:
+    """The feature spec and the plan digest of a store of these episodes, which decide its views."""
     data, extract = params.data, params.extract
-    views = {view for episode in episodes for view in episode.views}
-    spec = feature_spec(params.vlm, extract.dtype, sorted(views), digests.of, digests.text)
-    plan = joint_digest(
+    views = sorted({view for episode in episodes for view in episode.views})
+    spec = feature_spec(params.vlm, extract.dtype, views, digests.of, digests.text)
+    return spec, joint_digest(
         spec.digest,
         extract.sensor_dtype,
         *(["rate"] if data.action_hz is None else []),  # which earlier stores did not keep
         repr([(source.name, source.action_kind) for source in data.sources]),
         *(episode.digest for episode in episodes),
     )
-    return Survey(params, tuple(episodes), tuple(missing), tuple(bad), spec, rotation, plan)
 
 
 def sound_episodes(
@@ -154,22 +163,19 @@ def sound_episodes(
     checked, failed = check_episodes(surveyed)
     if not failed:
         return surveyed, checked
-    bad = list(surveyed.bad)
-    for episode, reason in failed:
-        digests.note_bad(episode.digest, reason)
-        bad.append(BadEpisode(episode.recording.source, episode.recording.path, reason))
+    for episode, bad in failed:
+        digests.note_bad(episode.digest, bad.reason)
     unusable = {episode.digest for episode, _ in failed}
     sound = [episode for episode in surveyed.episodes if episode.digest not in unusable]
-    again = _planned(
-        surveyed.params, sound, surveyed.missing, bad, surveyed.action_rotation, digests
-    )
-    kept = {episode.digest for episode in sound}
-    return again, [episode for episode in checked if episode.said["digest"] in kept]
+    spec, plan = _spec_and_plan(surveyed.params, sound, digests)
+    bad = (*surveyed.bad, *(bad for _, bad in failed))
+    again = replace(surveyed, episodes=tuple(sound), bad=bad, spec=spec, plan=plan)
+    return again, [episode for episode in checked if episode.said["digest"] not in unusable]
 
 
 def check_episodes(
     surveyed: Survey,
-) -> tuple[list[CheckedEpisode], list[tuple[SurveyedEpisode, str]]]:
+) -> tuple[list[CheckedEpisode], list[tuple[SurveyedEpisode, BadEpisode]]]:
     """Read and check every episode; returns the sound ones, and the others with the reason.
 
     Raises one `RecordingError` that lists all that cannot be used, unless
@@ -178,16 +184,14 @@ def check_episodes(
     """
     preparer = Preparer(surveyed.params.vlm, surveyed.spec)
     sound: list[CheckedEpisode] = []
-    failed: list[tuple[SurveyedEpisode, str]] = []
+    failed: list[tuple[SurveyedEpisode, BadEpisode]] = []
     for episode in tqdm(surveyed.episodes, "check", unit="episode", disable=None, leave=False):
         try:
             sound.append(_checked(episode, surveyed, preparer))
         except RecordingError as error:
-            failed.append((episode, str(error)))
-    bad = [
-        *surveyed.bad,
-        *(BadEpisode(e.recording.source, e.recording.path, reason) for e, reason in failed),
-    ]
+            of = episode.recording
+            failed.append((episode, BadEpisode(of.source, of.path, str(error))))
+    bad = [*surveyed.bad, *(bad for _, bad in failed)]
     if bad and (surveyed.params.data.on_bad_episode == "stop" or not sound):
         _refuse_bad(bad, of=len(sound) + len(bad))
     embodiment_of(sound)

@@ -186,9 +186,9 @@ def read_manifest(path: Path) -> Manifest:
 def archive(store: Path, output: Path, level: int, threads: int) -> Manifest | None:
     """Write the archive of a finished store to `output` and prove that it gives the store back.
 
-    `level` is zstd's, 1 to 22. The store is checked before, and every shard read back after it was
-    written. What is written lies in `<output>.part` until it is complete; stopped or killed, it is
-    begun anew. Returns None where an archive of this very store is there already.
+    `level` is zstd's, 1 to 22. The store is checked first, and every shard is read back once it is
+    written. The archive is written in `<output>.part`; after a kill it is begun anew. Returns None
+    where an archive of this very store is there already.
 
     Raises `StoreIncomplete` naming the file where the store is not finished or is damaged,
     `StoreMismatch` where something else lies at `output`, `StoreLocked` and `DiskFull`.
@@ -211,14 +211,14 @@ def archive(store: Path, output: Path, level: int, threads: int) -> Manifest | N
 
 
 def restore(archive: Path, target: Path, threads: int) -> None:
-    """Make the store that an archive was made from, equal in every byte of every file.
+    """Make the store of an archive again, equal in every byte of every file.
 
-    Built in `<target>.part` like any store and renamed when complete; stopped or killed, it is
+    It is built in `<target>.part` like any store and renamed when complete; after a kill it is
     begun anew. Where that very store is there already, nothing is done.
 
     Raises `StoreIncomplete` naming file and array where the archive is damaged, `StoreMismatch`
     where another store lies at `target` or is being built there, `ConfigError` where something
-    else does, `StoreLocked` and `DiskFull`.
+    else lies there, `StoreLocked` and `DiskFull`.
     """
     manifest = read_manifest(archive)
     with build_lock(target):

@@ -36,7 +36,6 @@ from pipeline.base.errors import (
 )
 from pipeline.extract import extract
 from pipeline.extract.cluster import ExtractionPlugin, check_scheduler, connected
-from pipeline.extract.plan import rate_name
 from pipeline.extract.survey import Survey, survey
 from pipeline.store import FeatureStore, RowSource, StoreBuild, part_path, read_plan
 from pipeline.store.schema import ARRAY_NAMES, read_specs
@@ -504,7 +503,7 @@ class TestLocalProcesses:
         assert report.computed == len(missing)
         assert_same(store, here)
         surveyed = survey(with_workers, ContentDigests(ledger_path(store)))
-        rate = ContentDigests(ledger_path(store)).rate(rate_name(surveyed))
+        rate = ContentDigests(ledger_path(store)).rate(surveyed.rate_name)
         assert rate is not None
         assert 0 < rate < math.inf
 
