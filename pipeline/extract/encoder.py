@@ -114,7 +114,7 @@ class Encoder:
         for batch in self._batches(rows):
             for submitted in self._submitted(batch):
                 ahead.append(submitted)
-                keep = 0 if all(each.done for each in submitted[1]) else 1
+                keep = 0 if all(part.done for part in submitted[1]) else 1
                 while len(ahead) > keep:
                     yield from self._finished(ahead.pop(0))
         for submitted in ahead:

@@ -213,9 +213,9 @@ def embodiment_of(checked: Sequence[CheckedEpisode]) -> Embodiment:
 def _refuse_rates(checked: Sequence[CheckedEpisode]) -> None:
     """Raise `StoreMismatch` where recorded rows, as ticks of one store, have no or two rates."""
     rates = sorted(
-        (one.ticks.recorded_hz, f"{one.source!r} ({one.recording.path})")
-        for one in checked
-        if one.ticks.recorded_hz
+        (episode.ticks.recorded_hz, f"{episode.source!r} ({episode.recording.path})")
+        for episode in checked
+        if episode.ticks.recorded_hz
     )
     if not rates:
         raise StoreMismatch(
@@ -275,12 +275,12 @@ def _surveyed(
         "content": _content(recording, digests),
     }
     group = recording.group
-    said = [text["id"], text["format"], text["instruction"], text["path"]]
+    parts = [text["id"], text["format"], text["instruction"], text["path"]]
     if group is not None:
-        said.append(group)
+        parts.append(group)
         text["group"] = group
     decides = repr((data.action_hz, data.vlm_reuse_count, rotation))
-    digest = joint_digest(text["content"], recording.source, *said, decides)
+    digest = joint_digest(text["content"], recording.source, *parts, decides)
     return SurveyedEpisode(recording, text | {"digest": digest}, tuple(recording.view_names()))
 
 

@@ -123,7 +123,7 @@ class Manifest(Document):
     )
     golden: dict[Annotated[str, Field(pattern=_FRAME)], Text] = Field(default_factory=dict)
 
-    def said(self, archive: Path) -> StoreAttributes:
+    def attributes(self, archive: Path) -> StoreAttributes:
         """The root attributes of the store. Raises `StoreIncomplete` where they are wrong."""
         return StoreAttributes.of(archive, self._parsed(archive, "", Group).attributes, _BORDER)
 
@@ -131,10 +131,10 @@ class Manifest(Document):
         """The arrays of the store. Raises `StoreIncomplete` where their metadata are wrong."""
         specs: dict[str, ArraySpec] = {}
         for name in self.arrays:
-            found = self._parsed(archive, name, dict[str, Any])
+            document = self._parsed(archive, name, dict[str, Any])
             where = f"{archive}, {name}/zarr.json of the store"
-            specs[name] = array_of(found, name, where, _BORDER)
-        check_agreement(archive, self.said(archive), specs, _BORDER)
+            specs[name] = array_of(document, name, where, _BORDER)
+        check_agreement(archive, self.attributes(archive), specs, _BORDER)
         return specs
 
     def _parsed(self, archive: Path, place: str, model: type[_Model]) -> _Model:
@@ -168,10 +168,10 @@ def read_manifest(path: Path) -> Manifest:
     """
     document = _manifest_document(path)
     if document is None:
-        found = f"no manifest in its {_ZARR_JSON}" if path.exists() else "nothing"
+        instead = f"no manifest in its {_ZARR_JSON}" if path.exists() else "nothing"
         raise StoreMismatch(
-            f"{path}: expected an archive, found {found}. Name one with archive.output, or make it "
-            "with stages.archive."
+            f"{path}: expected an archive, found {instead}. Name one with archive.output, or make "
+            "it with stages.archive."
         )
     if document.get("schema") != _SCHEMA:
         raise StoreMismatch(
@@ -294,16 +294,16 @@ def _write_array(
 
 
 def _rebuild(manifest: Manifest, archive: Path, target: Path, part: Path) -> None:
-    specs, said = manifest.specs(archive), manifest.said(archive)
+    specs, root = manifest.specs(archive), manifest.attributes(archive)
     _write_metadata(part, {n: text for n, text in manifest.metadata.items() if n != _ZARR_JSON})
-    with closing(StoreBuild(target, specs, said.plan)) as build:
+    with closing(StoreBuild(target, specs, root.plan)) as build:
         build.allocate()
         with _progress("restore", manifest.raw_bytes) as progress:
             for name, record in manifest.arrays.items():
                 array = _open_array(archive, specs[name], record)
                 for shard, rows in _shards(archive, specs[name], array):
                     _check_shard(shard, array)
-                    values = _read_shard(array, specs[name], shard, rows, said.seal)
+                    values = _read_shard(array, specs[name], shard, rows, root.seal)
                     build.write(name, rows.start, values)
                     progress.update(values.nbytes)
                 build.files(name).write_trailers()
@@ -316,7 +316,7 @@ def _rebuild(manifest: Manifest, archive: Path, target: Path, part: Path) -> Non
         sync(part / _ZARR_JSON)
         sync(part)
         try:
-            check_seal(part, said.seal, specs)
+            check_seal(part, root.seal, specs)
         except StoreIncomplete as error:
             raise _damaged(archive / _ZARR_JSON, str(error)) from None
         build.put_in_place()

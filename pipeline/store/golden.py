@@ -65,9 +65,9 @@ def read_golden(root: Path, keys: NDArray[np.uint8]) -> list[GoldenFrames]:
 
     Raises `StoreIncomplete` naming the one that cannot be read or does not give its key.
     """
-    said = laid_out_attributes(root)
-    entries = enumerate(said.golden)
-    return [_read(root, said, number, keys[entry.row]) for number, entry in entries]
+    attributes = laid_out_attributes(root)
+    entries = enumerate(attributes.golden)
+    return [_read(root, attributes, number, keys[entry.row]) for number, entry in entries]
 
 
 def carried_golden(
@@ -79,10 +79,10 @@ def carried_golden(
     """
     try:
         check_metadata(root)
-        said = laid_out_attributes(root)
+        attributes = laid_out_attributes(root)
     except StoreIncomplete:
         return
-    for number, entry in enumerate(said.golden):
+    for number, entry in enumerate(attributes.golden):
         with suppress(StoreIncomplete):
             golden = _unproven(root, number, entry)
             same = keys == np.frombuffer(golden.key(spec), np.uint8)
@@ -90,26 +90,28 @@ def carried_golden(
                 yield replace(golden, row=row)
 
 
-def golden_issues(root: Path, said: StoreAttributes, keys: ArraySpec | None) -> Iterator[Issue]:
+def golden_issues(
+    root: Path, attributes: StoreAttributes, keys: ArraySpec | None
+) -> Iterator[Issue]:
     """The damage of golden rows; none is found where the keys cannot be read."""
     if keys is None:
         return
-    for number, entry in enumerate(said.golden):
+    for number, entry in enumerate(attributes.golden):
         try:
             key = read_rows(root, keys, entry.row, entry.row + 1)[0]
         except StoreIncomplete:
             continue
         try:
-            _read(root, said, number, key)
+            _read(root, attributes, number, key)
         except StoreIncomplete as error:
             yield Issue(severity="error", kind="golden row", message=str(error), stream=GOLDEN)
 
 
-def golden_files(root: Path, said: StoreAttributes) -> set[Path]:
+def golden_files(root: Path, attributes: StoreAttributes) -> set[Path]:
     """The files of the golden rows that the root attributes list."""
-    groups = [root / GOLDEN] * ("golden" in said.model_fields_set)
+    groups = [root / GOLDEN] * ("golden" in attributes.model_fields_set)
     frames: list[Path] = []
-    for number, entry in enumerate(said.golden):
+    for number, entry in enumerate(attributes.golden):
         groups.append(root / GOLDEN / str(number))
         frames += [groups[-1] / view for view in entry.views]
     chunks = {frame / "c" / "0" / "0" / "0" for frame in frames}
@@ -133,10 +135,12 @@ def _write_frame(root: Path, name: str, frame: NDArray[np.uint8]) -> None:
     array[:] = frame
 
 
-def _read(root: Path, said: StoreAttributes, number: int, key: NDArray[np.uint8]) -> GoldenFrames:
+def _read(
+    root: Path, attributes: StoreAttributes, number: int, key: NDArray[np.uint8]
+) -> GoldenFrames:
     """One golden row; `StoreIncomplete` where it cannot be read or does not give the key."""
-    golden = _unproven(root, number, said.golden[number])
-    if golden.key(said.raw["feature_spec"]) != key.tobytes():
+    golden = _unproven(root, number, attributes.golden[number])
+    if golden.key(attributes.raw["feature_spec"]) != key.tobytes():
         why = f"golden frames and prompt of VL row {golden.row} do not give the key of that row"
         raise store_border(root).refusal(root / GOLDEN / str(number), why)
     return golden
@@ -152,8 +156,8 @@ def _unproven(root: Path, number: int, entry: StoredGolden) -> GoldenFrames:
 def _read_frame(root: Path, place: Path) -> NDArray[np.uint8]:
     """A frame (height, width, 3) that `_write_frame` wrote; never unpacks more than its shape."""
     border = store_border(root)
-    said = border.read_json(place / "zarr.json", FrameDocument)
-    frame = np.zeros(said.shape, np.uint8)
+    document = border.read_json(place / "zarr.json", FrameDocument)
+    frame = np.zeros(document.shape, np.uint8)
     chunk = place / "c" / "0" / "0" / "0"
     packed = border.read_bytes(chunk, frame.nbytes + 2**16)
     trailer = int.from_bytes(packed[-TRAILER_BYTES:], "little")

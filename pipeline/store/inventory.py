@@ -203,12 +203,12 @@ def _entry(path: Path, kind: str, base: Path) -> StoreEntry:
         if kind == "store" and is_archive(path):
             entry, manifest = replace(entry, kind="archive"), read_manifest(path)
             specs, rows = manifest.specs(path), manifest.specs(path)[CHECKSUMS].shape[0]
-            return replace(entry, attributes=manifest.said(path), specs=specs, done=rows)
+            return replace(entry, attributes=manifest.attributes(path), specs=specs, done=rows)
         if kind == "store":
             FeatureStore.open(path)
         if kind == "store" or is_store(path):
-            said, specs = laid_out_attributes(path), read_specs(path)
-            return replace(entry, attributes=said, specs=specs, done=_done(path))
+            root, specs = laid_out_attributes(path), read_specs(path)
+            return replace(entry, attributes=root, specs=specs, done=_done(path))
     except PipelineError as error:  # the others are listed
         return replace(entry, damage=str(error))
     except OSError as error:  # removed meanwhile, or not to be read
@@ -246,13 +246,13 @@ def _row(folder: Path, entry: StoreEntry) -> tuple[object, ...]:
 def _details(entry: StoreEntry) -> Iterator[str]:
     if entry.damage:
         yield f"damaged: {_first_clause(entry.damage)}"
-    if (said := entry.attributes) and entry.kind == "store":
+    if (root := entry.attributes) and entry.kind == "store":
         streams = ("tick/action", "sensor/values", "state/values")
         action, sensor, state = (entry.specs[name].shape[1] for name in streams)
-        rate = "recorded rows" if said.action_hz is None else f"{said.action_hz:g} Hz"
+        rate = "recorded rows" if root.action_hz is None else f"{root.action_hz:g} Hz"
         yield (
-            f"{said.streams.action.kind} action {action}, sensor {sensor}, state {state}; {rate}, "
-            f"an answer every {said.vlm_reuse_count} ticks; sources {', '.join(said.sources)}"
+            f"{root.streams.action.kind} action {action}, sensor {sensor}, state {state}; {rate}, "
+            f"an answer every {root.vlm_reuse_count} ticks; sources {', '.join(root.sources)}"
         ).strip()
     if entry.holder and entry.kind != "archive":
         doing = "being built" if entry.kind == "build" else "locked"

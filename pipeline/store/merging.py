@@ -337,11 +337,11 @@ def _fill(build: StoreBuild, merged: MergedEpisodes) -> None:
 def _golden(merged: MergedEpisodes) -> list[GoldenFrames]:
     """Golden rows of the merged store, chosen among those of the inputs and proven once more."""
     inputs = {store.path: read_golden(store.path, store.array(KEYS)) for store in merged.stores}
-    given = [
+    known = [
         replace(golden, row=golden.row + run.shift["vl"])
         for run in merged.runs
         for golden in inputs[run.store.path]
         if golden.row in run.rows["vl"]
     ]
-    views = np.array([len(golden.frames) for golden in given], np.int64)
-    return [given[place] for place in spread(np.arange(len(given)), views)]
+    views = np.array([len(golden.frames) for golden in known], np.int64)
+    return [known[place] for place in spread(np.arange(len(known)), views)]

@@ -143,18 +143,18 @@ def verify(path: Path, threads: int, workers: int | str = 0) -> Verification:
     attributes = find_attributes(path)
     read_plan(path)  # without one, nothing of it can be kept
     specs, issues = read_arrays(path)
-    said = None
+    parsed = None
     try:
-        said = StoreAttributes.of(path, attributes)
+        parsed = StoreAttributes.of(path, attributes)
         if not issues and (what := metadata_damage(path)):
             issues.append(_metadata_issue(path, what))
-        if said.seal is None:
+        if parsed.seal is None:
             issues.append(_metadata_issue(path, UNSEALED))
         if not issues:
-            check_agreement(path, said, specs)
+            check_agreement(path, parsed, specs)
     except StoreIncomplete as error:
         issues.append(_metadata_issue(path, str(error)))
-    reports = _check_chunks(path, specs, said.seal if said else None, threads, workers)
+    reports = _check_chunks(path, specs, parsed.seal if parsed else None, threads, workers)
     store = None
     if not issues:
         try:
@@ -162,9 +162,9 @@ def verify(path: Path, threads: int, workers: int | str = 0) -> Verification:
         except StoreIncomplete as error:
             issues.append(_metadata_issue(path, str(error)))
     issues += [issue for report in reports for issue in _issues(report, specs[report.array], store)]
-    if said is not None:
-        issues += golden_issues(path, said, specs.get(KEYS))
-    issues += strange_files(path, specs, golden_files(path, said) if said else None)
+    if parsed is not None:
+        issues += golden_issues(path, parsed, specs.get(KEYS))
+    issues += strange_files(path, specs, golden_files(path, parsed) if parsed else None)
     issues += [*_strange_to_zarr(path, issues)]
     refuse_replaced(path, inode)
     bad_rows = [report.rows.start + np.flatnonzero(report.faults) for report in reports]
@@ -176,7 +176,7 @@ def verify(path: Path, threads: int, workers: int | str = 0) -> Verification:
         seconds=time.monotonic() - begun,
         issues=tuple(issues),
         bad_rows=np.concatenate([np.zeros(0, np.int64), *bad_rows]),
-        environments=said.raw.get("environment", []) if said else [],
+        environments=parsed.raw.get("environment", []) if parsed else [],
     )
 
 
@@ -325,8 +325,8 @@ def _strange_to_zarr(root: Path, issues: Sequence[Issue]) -> Iterator[Issue]:
 
 def _metadata_issue(root: Path, what: str, array: str = "") -> Issue:
     file = root / array / "zarr.json"
-    said = what.removeprefix(f"{file}: ")
-    return _Error(kind="metadata", message=said, stream=array, file=file)
+    message = what.removeprefix(f"{file}: ")
+    return _Error(kind="metadata", message=message, stream=array, file=file)
 
 
 def _run(checks: Sequence[Callable[[], ChunkReport]], threads: int) -> Generator[ChunkReport]:
