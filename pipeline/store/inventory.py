@@ -108,8 +108,7 @@ def fate_of(entry: StoreEntry) -> tuple[Fate, str]:
         return "kept", f"a finished {kind}, which is never removed here"
     if path.is_symlink():
         return "kept", "a symbolic link, left alone"
-    is_ours = is_ledger(path) if kind == "ledger" else path.is_file() or _owner(path)
-    if not is_ours:
+    if not _is_ours(entry):
         return "kept", "this project did not write it, left alone"
     if entry.holder:
         return "kept", f"in use by {entry.holder}"
@@ -197,9 +196,13 @@ def _walk(folder: Path, subfolders: bool) -> Iterator[tuple[Path, str, Path]]:
 
 def _entry(path: Path, kind: str, base: Path) -> StoreEntry:
     lock = base.with_name(base.name + ".lock")
-    entry = StoreEntry(path, kind, base, _bytes(path))
+    holder = damage = None
     try:
-        entry = replace(entry, holder=lock_holder(lock) if lock.exists() else None)
+        holder = lock_holder(lock) if lock.is_file() else None
+    except PipelineError as error:  # a file that is no lock tells nothing of the others
+        damage = str(error) if kind == "lock" else None
+    entry = StoreEntry(path, kind, base, _bytes(path), damage=damage, holder=holder)
+    try:
         if kind == "store" and is_archive(path):
             entry, manifest = replace(entry, kind="archive"), read_manifest(path)
             specs, rows = manifest.specs(path), manifest.specs(path)[CHECKSUMS].shape[0]
@@ -278,6 +281,14 @@ def _spec(entry: StoreEntry) -> tuple[str, str]:
 def _first_clause(damage: str) -> str:
     """What is wrong, without what to run about it."""
     return damage.split(". ", 1)[0].splitlines()[0]
+
+
+def _is_ours(entry: StoreEntry) -> bool:
+    if entry.kind == "lock":
+        return entry.path.is_file() and entry.damage is None
+    if entry.kind == "ledger" and not entry.path.name.endswith(LEDGER_SUFFIX):
+        return entry.path.is_file()  # SQLite's own, beside it
+    return is_ledger(entry.path) if entry.kind == "ledger" else _owner(entry.path) is not None
 
 
 def _owner(path: Path) -> OutputKind | None:

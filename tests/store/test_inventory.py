@@ -283,12 +283,13 @@ class TestLeftovers:
             remove_entry(leftover)
         assert KEPT.owns(kept)
 
-    def test_a_foreign_file_at_a_ledger_is_no_leftover(self, tmp_path: Path) -> None:
-        ledger = tmp_path / "gone.zarr.files.sqlite"
-        ledger.write_text("years of work")
+    @pytest.mark.parametrize("suffix", ["files.sqlite", "lock", "part", "previous"])
+    def test_a_foreign_file_is_no_leftover(self, tmp_path: Path, suffix: str) -> None:
+        foreign = tmp_path / f"gone.zarr.{suffix}"
+        foreign.write_text("years of work")
         assert unneeded(tmp_path) == []
         with pytest.raises(ConfigError, match="did not write"):
-            find_named(list_stores(tmp_path), [ledger])
+            find_named(list_stores(tmp_path), [foreign])
 
     def test_nothing_behind_a_symbolic_link_is_touched(
         self, tiny_store: Make, tmp_path: Path
