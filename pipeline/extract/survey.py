@@ -294,15 +294,21 @@ def _content(recording: Recording, digests: ContentDigests) -> str:
     One entry an episode: to look up each of its files would take longer than their `stat`.
     """
     listed = [str(_CONTENT_VERSION), recording.identity(), str(recording.path)]
-    real: dict[str, str] = {}
+    folders: dict[str, str] = {}
+    places: dict[str, str] = {}
     try:
         for file in map(str, recording.files()):
             status = os.stat(file)  # noqa: PTH116, a tenth of the time of a path's
             folder, _, name = file.rpartition("/")
-            if folder not in real:
-                real[folder] = os.path.realpath(folder)
+            if folder not in folders:
+                folders[folder] = os.path.realpath(folder)
+            places[file] = f"{folders[folder]}/{name}"
             what = f"{status.st_mode} {status.st_size} {status.st_mtime_ns}"
-            listed.append(f"{what} {real[folder]}/{name}")
+            listed.append(f"{what} {places[file]}")
     except OSError:
         return content_digest(recording, digests.of)  # which names the file
-    return digests.text(joint_digest(*listed), lambda: content_digest(recording, digests.of))
+
+    def of_place(file: Path) -> str:
+        return digests.of(Path(places[str(file)]))
+
+    return digests.text(joint_digest(*listed), lambda: content_digest(recording, of_place))
