@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from benchmarks.workload import Workload
 from pipeline.data.row_range import RowRange
 from pipeline.extract.encoder import Encoder
-from pipeline.extract.engine import ReadyRow, Row, RowPreparation, fill, in_background
-from pipeline.vlm.preparation import Preparer
+from pipeline.extract.engine import compute_here, fill, in_background
+from pipeline.extract.rows import ReadyRow, Row, RowPreparation
 from pipeline.vlm.qwen import FrozenVLM
 
 
@@ -48,7 +48,7 @@ class StageOne:
         surveyed = replace(work.survey, params=params)
         # Stage one takes the model that is there instead of loading it again.
         with patch.object(FrozenVLM, "load", return_value=self._vlm):
-            done = fill(self._build, surveyed, [], work.digests, work.missing)
+            done = fill(self._build, surveyed, [], work.digests, work.missing, compute_here)
         assert done.computed + done.repeated == len(work.missing), done
         assert done.model_share is not None and done.waited_share is not None
         self.shares.append((done.model_share, done.waited_share))
@@ -73,9 +73,8 @@ def _all(images: Sequence[NDArray[np.uint8]]) -> tuple[Sequence[NDArray[np.uint8
 
 def _settled(workload: Workload, vlm: FrozenVLM) -> int:
     """The batch size that `auto` settles on when it sees these rows over and over."""
-    params, spec = workload.params, workload.survey.spec
-    preparation = RowPreparation(Preparer(params.vlm, spec), spec, [])
-    threads = params.extract.decode_threads
+    preparation = RowPreparation(workload.survey, [])
+    threads = workload.params.extract.decode_threads
     rows = [
         row
         for prepared in in_background(workload.ranges(), preparation.prepare, threads)

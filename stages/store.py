@@ -33,21 +33,21 @@ if __name__ == "__main__":  # here, for --help waits for no import below
     )
 
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 from pipeline.base.config import Params, StoresParams
 from pipeline.base.errors import ConfigError, PipelineError, StoreLocked
 from pipeline.base.format import size
 from pipeline.store import FeatureStore
-from pipeline.store.admin import (
-    Inventory,
-    Leftover,
-    describe_inventory,
+from pipeline.store.inventory import (
+    StoreEntry,
     describe_kept,
-    find_leftovers,
+    describe_stores,
+    fate_of,
     find_named,
-    remove_leftover,
-    take_inventory,
+    list_stores,
+    remove_entry,
 )
 from pipeline.store.merging import merge
 from pipeline.train.run import find_trained
@@ -70,18 +70,18 @@ def _list(params: StoresParams) -> None:
             f"stores.inputs: list takes no paths, found {', '.join(map(str, params.inputs))}. It "
             "lists all of stores.folder: name another with --set stores.folder=…"
         )
-    inventory = take_inventory(params.folder)
-    print(*describe_inventory(inventory, _dependents(inventory, params)), sep="\n")
+    entries = list_stores(params.folder)
+    print(*describe_stores(params.folder, entries, _dependents(entries, params)), sep="\n")
 
 
-def _dependents(inventory: Inventory, params: StoresParams) -> dict[Path, list[str]]:
-    """What trained policies say of each store; those that say nothing readable go to stderr."""
+def _dependents(entries: Sequence[StoreEntry], params: StoresParams) -> dict[Path, list[str]]:
+    """The trained policies that depend on each store; those that cannot be read go to stderr."""
     trained = find_trained(params.checkpoints)
     for policy in trained:
         if policy.damage:
             print(f"not read: {policy.damage}", file=sys.stderr)
     dependents: dict[Path, list[str]] = {}
-    for entry in inventory.entries:
+    for entry in entries:
         if entry.kind == "store" and entry.damage is None:
             store = FeatureStore.open(entry.path)
             depends = ((policy.folder, policy.depends_on(store)) for policy in trained)
@@ -99,42 +99,28 @@ def _merge(params: StoresParams) -> None:
 
 
 def _gc(params: StoresParams) -> None:
-    leftovers = _selected(params) if params.inputs else _unneeded(params)
-    done: list[Leftover] = []
+    if params.inputs:
+        folders = dict.fromkeys(path.parent for path in params.inputs)
+        entries = [entry for at in folders for entry in list_stores(at, subfolders=False)]
+        leftovers = find_named(entries, params.inputs)
+    else:
+        entries = list_stores(params.folder)
+        leftovers = [entry for entry in entries if fate_of(entry)[0] == "unneeded"]
+        for line in describe_kept(entries):
+            print(f"kept: {line}")
     locked: list[PipelineError] = []
-    for leftover in leftovers:
+    for entry in leftovers:
+        word, why = "removed" if params.remove else "unneeded", fate_of(entry)[1]
         try:
             if params.remove:
-                remove_leftover(leftover)
-            done.append(leftover)
+                remove_entry(entry)
+            print(f"{word}: {entry.path}, {size(entry.bytes)}: {why}")
         except StoreLocked as error:
             locked.append(error)
-    word = "removed" if params.remove else "unneeded"
-    for leftover in done:
-        print(f"{word}: {leftover.entry.path}, {size(leftover.entry.bytes)}: {leftover.why}")
     if not leftovers:
         print(f"{params.folder}: nothing to remove")
     elif not params.remove:
-        freed = size(sum(leftover.entry.bytes for leftover in leftovers))
+        freed = size(sum(entry.bytes for entry in leftovers))
         print(f"{freed} in {len(leftovers)} place(s); --remove removes them")
     if locked:
         raise locked[0]
-
-
-def _unneeded(params: StoresParams) -> list[Leftover]:
-    inventory = take_inventory(params.folder)
-    for line in describe_kept(inventory):
-        print(f"kept: {line}")
-    return find_leftovers(inventory)
-
-
-def _selected(params: StoresParams) -> list[Leftover]:
-    """What is named, wherever it lies; only what lies beside it is looked at."""
-    by_folder: dict[Path, list[Path]] = {}
-    for path in params.inputs:
-        by_folder.setdefault(path.parent, []).append(path)
-    return [
-        leftover
-        for folder, paths in by_folder.items()
-        for leftover in find_named(take_inventory(folder, subfolders=False), paths)
-    ]

@@ -15,8 +15,8 @@ TIERS = (
     {"extract", "train", "simulation"},
     {"robot"},
     {"evaluate"},
-    {"compat"},
-    {"models", "datasets", "look"},
+    {"look", "compat"},
+    {"models", "datasets"},
 )
 """Rooms import from tiers above theirs in this list, and from themselves."""
 
@@ -35,16 +35,16 @@ ONLY_IN = {
 }
 WITHOUT_TORCH = {"data"}
 STAGE_ONE = {"vlm", "data", "extract", "simulation"}
-"""What stage two runs without, but for fine-tuning."""
+"""Rooms that stage two runs without, except fine-tuning."""
 
 
 def modules() -> dict[str, Path]:
     """Every module of `pipeline` and `stages` by dotted name."""
-    found = {}
+    by_name = {}
     for path in sorted([*ROOT.glob("pipeline/**/*.py"), *ROOT.glob("stages/**/*.py")]):
         parts = path.relative_to(ROOT).with_suffix("").parts
-        found[".".join(part for part in parts if part != "__init__")] = path
-    return found
+        by_name[".".join(part for part in parts if part != "__init__")] = path
+    return by_name
 
 
 MODULES = modules()
@@ -86,6 +86,16 @@ def test_a_room_imports_only_from_rooms_below(module):
                 assert room(imported) not in STAGE_ONE, f"{module} imports {imported}"
 
 
+def test_no_circle_of_files_exists():
+    """Lazy imports count, too: a file is below another, above it, or knows nothing of it."""
+    left = set(MODULES)
+    while left:
+        used = {name for module in left for name in imports(module) & left}
+        ends = {module for module in left if module not in used or not imports(module) & left}
+        assert ends, f"files in circles, or between two of them: {sorted(left)}"
+        left -= ends
+
+
 @pytest.mark.parametrize("module", MODULES)
 def test_heavy_libraries_stay_in_their_rooms(module):
     for imported in imports(module):
@@ -101,21 +111,24 @@ def test_nothing_is_loaded_that_could_run_its_own_code(folder):
     for path in (ROOT / folder).rglob("*.py"):
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             if isinstance(node, ast.Call) and ast.unparse(node.func).endswith(".from_pretrained"):
-                said = {word.arg: ast.unparse(word.value) for word in node.keywords}
+                keywords = {word.arg: ast.unparse(word.value) for word in node.keywords}
                 from_peft = ast.unparse(node.func).startswith("Peft")
-                assert from_peft or said.get("trust_remote_code") == "False", (path, node.lineno)
+                assert from_peft or keywords.get("trust_remote_code") == "False", (
+                    path,
+                    node.lineno,
+                )
 
 
 def reached(module: str) -> set[str]:
     """The project's modules that importing this one runs, packages on the way included."""
-    found: set[str] = set()
+    names: set[str] = set()
     waiting = [module]
     while waiting:
         name = waiting.pop()
-        if name in MODULES and name not in found:
-            found.add(name)
+        if name in MODULES and name not in names:
+            names.add(name)
             waiting += [*imports(name), name.rpartition(".")[0]]
-    return found
+    return names
 
 
 def has_code(path: Path) -> bool:
@@ -150,7 +163,7 @@ def test_every_module_a_stage_runs_is_among_its_deps(stage, module):
 
 
 def test_stage_two_knows_nothing_of_stage_one():
-    """But the report of an evaluation shows frames, which only recordings have."""
+    """Except that the report of an evaluation shows frames, which only recordings have."""
     shown = {"train_head": set(), "evaluate": {"data"}}
     for stage, known in shown.items():
         rooms = {room(name) for name in reached(f"stages.{stage}") if name.startswith("pipeline.")}
@@ -164,6 +177,6 @@ def test_the_pictures_rooms_exist():
 
 @pytest.mark.parametrize("module", MODULES)
 def test_only_one_module_removes_folders(module):
-    """It asks whose they are."""
+    """It refuses those that are not this project's."""
     text = MODULES[module].read_text(encoding="utf-8")
     assert module == "pipeline.base.ownership" or "rmtree" not in text

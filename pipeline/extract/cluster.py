@@ -1,9 +1,8 @@
-"""The engine on dask workers: ranges of rows are handed out, what was written is marked here.
+"""The executor on dask workers: they write ranges of rows, this process marks what was written.
 
-Dask tries again what failed, and what a worker had when it died. What it gives up is computed at
-the end, one episode at a time while nothing else is, so that no recording is blamed for another.
-Each worker process holds one model. Its threads take turns with it: while one encodes, the others
-prepare.
+Dask repeats tasks that failed or whose worker died. Those that it gives up are computed at the end,
+one episode at a time, so that no recording is blamed for another. Each worker process holds one
+model, with which its threads take turns: while one encodes, the others prepare.
 """
 
 import math
@@ -16,7 +15,6 @@ import time
 from collections.abc import Generator, Iterable, Iterator, Sequence
 from concurrent.futures import CancelledError, ThreadPoolExecutor
 from contextlib import closing, contextmanager
-from dataclasses import dataclass
 from functools import partial
 from itertools import islice
 from multiprocessing import active_children, resource_tracker
@@ -51,8 +49,9 @@ from pipeline.base.errors import (
     StoreIncomplete,
 )
 from pipeline.base.scheduler import client_of, private_cluster, quiet
-from pipeline.data.row_range import by_episode
-from pipeline.extract.engine import FeatureBlock, Row, RowEngine, RowMarks, WrittenRows, row_frames
+from pipeline.data.row_range import RowFrames, by_episode
+from pipeline.extract.engine import RowEngine, Speed
+from pipeline.extract.rows import FeatureBlock, Row, RowMarks, WrittenRows, row_frames
 from pipeline.extract.survey import Survey
 from pipeline.store import FEATURES, RowSource, StoreBuild, part_path, read_plan
 from pipeline.store.schema import read_specs
@@ -66,11 +65,10 @@ _AUTO_RANGE_ROWS = 32
 # Tasks that the scheduler holds: enough for hundreds of workers, never millions.
 _TASKS_AHEAD = 1000
 
-# So many workers dead, each with a task that dask gave up, before a row is written are no
-# recording's fault.
+# When so many workers have died before any row was written, no recording is to blame.
 _HOPELESS_DEATHS = 4
 
-# For processes of this machine to come back after a death, however long their imports take.
+# Time for local processes to come back after a death, however long their imports take.
 _LOCAL_PATIENCE = {
     "distributed.deploy.lost-worker-timeout": "1h",
     "distributed.scheduler.no-workers-timeout": "120s",
@@ -81,11 +79,11 @@ _LOOK_EVERY_S = 0.05
 
 # Rows that one task computes, ascending.
 Range = NDArray[np.int64]
-# Of a task: what it returned, or in its place an exception.
+# What a task returned, or the exception that it raised.
 Result = Any
 
 
-def compute_rows(plugin: str, rows: NDArray[np.int64]) -> list[WrittenRows] | Exception:
+def compute_rows(plugin: str, rows: Range) -> list[WrittenRows] | Exception:
     """The task: write the features of these rows.
 
     Raises `RecordingError` or `NumericsError` where a recording cannot be computed, which dask
@@ -100,35 +98,24 @@ def compute_rows(plugin: str, rows: NDArray[np.int64]) -> list[WrittenRows] | Ex
         return error
 
 
-@dataclass(frozen=True)
-class ExtractionJob:
-    """What every process of an extraction must know.
+class ExtractionPlugin(WorkerPlugin):
+    """A worker's part of an extraction; workers that join later get it, too.
 
-    `known` are stores and builds of the same feature spec, `folder` is where the coordinator runs:
-    relative paths begin there.
+    The coordinator makes it, and dask sends it to every worker.
     """
 
-    surveyed: Survey
-    known: tuple[Path, ...]
-    folder: Path
-
-    @property
-    def name(self) -> str:
-        """Of its plugin: an extraction that was killed is replaced by the next on its store."""
-        return f"extraction of {self.surveyed.target.absolute()}"
+    def __init__(self, surveyed: Survey, known: Sequence[Path]) -> None:
+        """`known` are stores and builds of the same feature spec."""
+        self.surveyed = surveyed
+        self.known = [path.absolute() for path in known]
+        self.folder = Path.cwd()  # where relative paths begin
+        # The next extraction of a store replaces the plugin of one that was killed.
+        self.name = f"extraction of {surveyed.target.absolute()}"
 
     @property
     def local(self) -> bool:
-        """Whether all its processes are on the coordinator's host."""
+        """Whether all workers are on the coordinator's host."""
         return isinstance(self.surveyed.params.extract.workers, int)
-
-
-class ExtractionPlugin(WorkerPlugin):
-    """A worker's half of an extraction; also on workers that join later."""
-
-    def __init__(self, job: ExtractionJob) -> None:
-        self.job = job
-        self.name = job.name
 
     def setup(self, worker: Worker) -> None:
         """Prepare to begin with the first task; whatever fails then is that task's error."""
@@ -145,7 +132,7 @@ class ExtractionPlugin(WorkerPlugin):
                 self._engine = None
                 self._build.close()
 
-    def compute(self, rows: NDArray[np.int64]) -> list[WrittenRows]:
+    def compute(self, rows: Range) -> list[WrittenRows]:
         """Write the features of these rows; equal ones among them are computed once."""
         engine = self._opened()
         prepared = _prepared(engine, rows)
@@ -157,22 +144,53 @@ class ExtractionPlugin(WorkerPlugin):
                 raise StoreIncomplete(f"{self.name} has ended; its rows are nobody's")
             return [block.write(self._build) for block in blocks]
 
+    def check_place(self) -> None:
+        """Raise `ConfigError` where this worker does not see the coordinator's files."""
+        here, host = Path.cwd(), socket.gethostname()
+        surveyed, part = self.surveyed, part_path(self.surveyed.target)
+        same = self.folder.is_dir() and here.samefile(self.folder)
+        if not same or read_plan(part) != surveyed.plan:
+            raise ConfigError(
+                f"the worker on {host} runs in {here}, the coordinator in {self.folder}, with the "
+                f"build {part}. Start every worker with `cd {self.folder}`, and set extract.store "
+                "to a folder of a file system that all hosts share."
+            )
+        if not self.local:
+            params, spec = surveyed.params, surveyed.spec
+            ours = feature_spec(params.vlm, params.extract.dtype, spec.views, file_digest)
+            if ours.digest != spec.digest:
+                lines = "; ".join(describe(differences(ours.attrs(), spec.attrs())))
+                raise ConfigError(
+                    f"the worker on {host} would compute other features than the coordinator asks "
+                    f"for: {lines}. Give it the same checkpoint and the same version of this "
+                    "package."
+                )
+
+    def device_of(self, worker_name: object) -> str:
+        """The device of a worker: local ones take turns over the GPUs, others use their first.
+
+        As dask-cuda, and CUDA_VISIBLE_DEVICES, show each worker its own first.
+        """
+        wanted, devices = self.surveyed.params.extract.device, torch.cuda.device_count()
+        turns = wanted in ("auto", "cuda") and devices > 1
+        if self.local and isinstance(worker_name, int) and turns:
+            return f"cuda:{worker_name % devices}"
+        return wanted
+
     def _opened(self) -> RowEngine:
         """The worker's engine; its files are opened on the first call."""
-        surveyed = self.job.surveyed
         with self._opening:
             if self._engine is None:
-                check_place(self.job)
-                known = [RowSource(path) for path in self.job.known]
+                self.check_place()
+                surveyed, known = self.surveyed, [RowSource(path) for path in self.known]
                 specs = read_specs(part_path(surveyed.target))
                 self._build = StoreBuild(surveyed.target, specs, surveyed.plan)
                 frames = row_frames(self._build, surveyed)
-                device = device_of(self.job, self._number)
-                self._engine = RowEngine(surveyed, frames, known, device)
+                self._engine = RowEngine(surveyed, frames, known, self.device_of(self._number))
             return self._engine
 
 
-def _prepared(engine: RowEngine, rows: NDArray[np.int64]) -> list[Row]:
+def _prepared(engine: RowEngine, rows: Range) -> list[Row]:
     firsts: dict[bytes, int] = {}
     try:
         parts = engine.frames.ranges(rows)
@@ -183,77 +201,46 @@ def _prepared(engine: RowEngine, rows: NDArray[np.int64]) -> list[Row]:
         raise RecordingError(f"{type(error).__name__}: {error}") from None
 
 
-def device_of(job: ExtractionJob, worker_name: object) -> str:
-    """The device of a worker: local ones take turns over the GPUs, others use the first they see.
-
-    As dask-cuda, and CUDA_VISIBLE_DEVICES, show each worker its own first.
-    """
-    wanted, devices = job.surveyed.params.extract.device, torch.cuda.device_count()
-    if job.local and isinstance(worker_name, int) and wanted in ("auto", "cuda") and devices > 1:
-        return f"cuda:{worker_name % devices}"
-    return wanted
-
-
-def check_place(job: ExtractionJob) -> None:
-    """Raise where this worker does not see the files that the coordinator sees, or not the same."""
-    here, host = Path.cwd(), socket.gethostname()
-    surveyed, part = job.surveyed, part_path(job.surveyed.target)
-    same = job.folder.is_dir() and here.samefile(job.folder)
-    if not same or read_plan(part) != surveyed.plan:
-        raise ConfigError(
-            f"the worker on {host} runs in {here}, the coordinator in {job.folder}, with the build "
-            f"{part}. Start every worker with `cd {job.folder}`, and set extract.store to a folder "
-            "of a file system that all hosts share."
-        )
-    if not job.local:
-        params, spec = surveyed.params, surveyed.spec
-        ours = feature_spec(params.vlm, params.extract.dtype, spec.views, file_digest)
-        if ours.digest != spec.digest:
-            lines = "; ".join(describe(differences(ours.attrs(), spec.attrs())))
-            raise ConfigError(
-                f"the worker on {host} would compute other features than the coordinator asks "
-                f"for: {lines}. Give it the same checkpoint and the same version of this package."
-            )
-
-
 def compute_on_cluster(
     surveyed: Survey,
-    known: Sequence[Path],
-    vl_start: NDArray[np.int64],
-    missing: NDArray[np.int64],
+    known: Sequence[RowSource],
+    frames: RowFrames,
+    missing: Range,
     marks: RowMarks,
-) -> float | None:
-    """Have `extract.workers` compute every missing row; rows a second, None where too few to tell.
+) -> Speed:
+    """The executor of `extract.workers`; a speed where more rows came than the first ones.
 
     Raises at once what stops every row: `ConfigError` for a wrong address or a worker elsewhere,
     `VLMError`, `DiskFull`, `PipelineError` where the scheduler or all workers are lost. Raises
     `RecordingError` after all other rows where some could not be computed.
     """
     extract, array = surveyed.params.extract, marks.build.specs[FEATURES]
-    job = ExtractionJob(surveyed, tuple(path.absolute() for path in known), Path.cwd())
+    plugin = ExtractionPlugin(surveyed, [source.path for source in known])
     rows = _AUTO_RANGE_ROWS if extract.batch_size == "auto" else extract.batch_size
     most = max(1, rows // surveyed.spec.variants)
     # Where hosts may differ, no two ranges share a page of the file.
-    together = 1 if job.local else rows_between_pages(array.row_bytes)
+    together = 1 if plugin.local else rows_between_pages(array.row_bytes)
     ranges = ranges_of(missing, most, array.chunk_rows, together)
     begun, before = 0.0, 0
-    with connected(extract) as client, _plugged(client, job):
-        tasks = ClusterTasks(client, job, vl_start)
+    with connected(extract) as client, _plugged(client, plugin):
+        tasks = ClusterTasks(client, plugin, frames.vl_start)
         with closing(tasks.results(ranges)) as results:
             for written in results:
                 marks.mark(written)
                 if not before:  # until then workers start and load the model
                     begun, before = time.monotonic(), marks.counts["computed"]
     later = marks.counts["computed"] - before
-    return later / (time.monotonic() - begun) if later else None
+    return Speed(later / (time.monotonic() - begun) if later else None)
 
 
 class ClusterTasks:
     """Ranges on their way to workers and back."""
 
-    def __init__(self, client: Client, job: ExtractionJob, vl_start: NDArray[np.int64]) -> None:
+    def __init__(
+        self, client: Client, plugin: ExtractionPlugin, vl_start: NDArray[np.int64]
+    ) -> None:
         self._client = client
-        self._job = job
+        self._plugin = plugin
         self._vl_start = vl_start
         self._dead: set[str] = set()
         self._any_written = False
@@ -261,7 +248,7 @@ class ClusterTasks:
     def results(self, ranges: Iterable[Range]) -> Generator[list[WrittenRows]]:
         """What workers wrote; raises at the end what could not be computed."""
         given_up: list[Range] = []
-        for done in self._completed(ranges, self._job.surveyed.params.extract.retries):
+        for done in self._completed(ranges, self._plugin.surveyed.params.extract.retries):
             written = [block for _, result in done if isinstance(result, list) for block in result]
             self._any_written |= bool(written)
             yield written
@@ -290,7 +277,7 @@ class ClusterTasks:
     ) -> Iterator[list[tuple[Range, Result]]]:
         """Ranges and what came of them, as they are done."""
         left, under_way = iter(ranges), dict[Future[Any], Range]()
-        submit = partial(self._client.submit, compute_rows, self._job.name, pure=False)
+        submit = partial(self._client.submit, compute_rows, self._plugin.name, pure=False)
 
         def submitted(count: int) -> Iterable[Future[Any]]:
             futures = {submit(rows, retries=retries): rows for rows in islice(left, count)}
@@ -310,7 +297,7 @@ class ClusterTasks:
             yield done
 
     def _raise_unless_recording(self, error: Exception) -> None:
-        """Raise what the recordings of a range cannot be to blame for."""
+        """Raise an error that no recording can be blamed for."""
         if isinstance(error, CancelledError):
             raise PipelineError(
                 f"the connection to the dask scheduler was lost ({error}). What was written is "
@@ -333,29 +320,29 @@ class ClusterTasks:
             )
 
     def _reason(self, episode: int, rows: Range, error: Exception) -> str:
-        """Why the rows of an episode could not be computed, alone."""
+        """Why the rows of an episode could not be computed even alone."""
         self._raise_unless_recording(error)
         if isinstance(error, KilledWorker):
             deaths = 1 + error.allowed_failures
             error = RecordingError(f"every worker died that computed them alone ({deaths} deaths)")
-        path = str(self._job.surveyed.recordings[episode].path)
+        path = str(self._plugin.surveyed.recordings[episode].path)
         where = "" if path in str(error) else f"{path}, VL rows {rows[0]} to {rows[-1]}: "
         return f"{where}{error}"
 
 
 def rows_between_pages(row_bytes: int) -> int:
-    """Every how many rows one begins where a page of its file begins.
+    """The least number of rows that fills whole pages of a file.
 
-    Divides every chunk: chunks are multiples of 4,096 rows.
+    It divides every chunk: chunks are multiples of 4,096 rows.
     """
     return PAGE_BYTES // math.gcd(row_bytes, PAGE_BYTES)
 
 
 def ranges_of(missing: Range, most: int, chunk_rows: int, together: int = 1) -> list[Range]:
-    """Rows (ascending, of `missing`) that each task computes: as many as `most`, or a few more.
+    """The ranges of `missing` (ascending) that tasks compute: `most` rows each, or a few more.
 
-    A range lies within one chunk. Blocks of `together` rows, which divide a chunk, are never cut,
-    for hosts must not share a page.
+    A range lies within one chunk. Blocks of `together` rows, which divide a chunk, are never cut:
+    hosts must not share a page.
     """
     chunk, block = missing // chunk_rows, missing // together
     begin = np.searchsorted(block, block) - np.searchsorted(chunk, chunk)
@@ -364,10 +351,10 @@ def ranges_of(missing: Range, most: int, chunk_rows: int, together: int = 1) -> 
 
 
 @contextmanager
-def _plugged(client: Client, job: ExtractionJob) -> Generator[None]:
-    """Give every worker, now and later, what it needs; take it back at the end."""
+def _plugged(client: Client, plugin: ExtractionPlugin) -> Generator[None]:
+    """Give the plugin to every worker, now and later; take it back at the end."""
     try:
-        client.register_plugin(ExtractionPlugin(job))
+        client.register_plugin(plugin)
     except ImportError as error:
         raise ConfigError(
             f"extract.workers: a worker cannot import what it should run ({error}). Install the "
@@ -382,7 +369,7 @@ def _plugged(client: Client, job: ExtractionJob) -> Generator[None]:
         yield
     finally:
         if client.status == "running":
-            client.unregister_worker_plugin(job.name)
+            client.unregister_worker_plugin(plugin.name)
 
 
 def check_scheduler(address: str) -> None:
@@ -415,11 +402,10 @@ def connected(extract: ExtractParams) -> Generator[Client]:
 
 @contextmanager
 def _local_cluster(workers: int, extract: ExtractParams) -> Generator[LocalCluster]:
-    """Worker processes of this host, all of them up; raises `PipelineError` where they cannot be.
+    """Worker processes of this host; raises `PipelineError` where they cannot be started.
 
-    One thread of each has the model, the others prepare. Dask cannot be interrupted while they
-    start without noise and orphans, so a thread starts them and an interrupted coordinator kills
-    what was begun: then that thread ends by itself.
+    Interrupting dask while they start leaves noise and orphans. So a thread starts them, and an
+    interrupted coordinator kills the processes, upon which that thread ends by itself.
     """
     cores = len(os.sched_getaffinity(0))
     threads = os.environ.get("OMP_NUM_THREADS") or str(max(1, cores // workers))

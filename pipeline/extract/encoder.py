@@ -10,14 +10,14 @@ from numpy.typing import NDArray
 
 from pipeline.base.arrays import array_of
 from pipeline.base.errors import NumericsError, VLMError
-from pipeline.extract.engine import ReadyRow
+from pipeline.extract.rows import ReadyRow
 from pipeline.vlm.preparation import TokenLayout
 from pipeline.vlm.qwen import FrozenVLM, Pending
 
-# Fewer are slower on any device; where they do not fit, memory running out says so.
+# Fewer rows are slower on any device; where these do not fit, an out-of-memory halves them.
 _FIRST = 8
 
-# Past these, more rows gain nothing and only hold memory.
+# Beyond these, more rows gain nothing and only hold memory.
 _MOST = {"cpu": 64, "cuda": 512}
 
 # Batches of a size that are timed; the one before them warms up.
@@ -40,7 +40,7 @@ class BatchSize:
     """
 
     def __init__(self, size: int | Literal["auto"], device: str = "cpu") -> None:
-        """`device` is the type of the one that the model is on."""
+        """`device` is the type of the model's device."""
         self.current = _FIRST if size == "auto" else size
         self.settled = size != "auto"
         self._most = _MOST[device]
@@ -49,7 +49,7 @@ class BatchSize:
         self._speeds: list[float] = []
 
     def note(self, size: int, tokens: int, seconds: float) -> None:
-        """What a full batch of this size took.
+        """Note how long a full batch of this size took.
 
         Tokens, not rows, are counted: rows of another shape have more of them.
         """
@@ -98,16 +98,15 @@ class Encoder:
         self, vlm: FrozenVLM, batch_size: int | Literal["auto"], variants: int = 1
     ) -> None:
         """With "auto" the first batches are measured, and the size settles where it is fastest."""
-        self.model_s = 0.0  # that the model worked on what was handed out so far
+        self.model_s = 0.0  # the time that the model worked on what was handed out so far
         self._vlm = vlm
         self.size = BatchSize(batch_size, vlm.device.type)
         self._variants = variants
 
     def encoded(self, rows: Iterable[ReadyRow]) -> Iterator[Encoded]:
-        """Every row once, batch by batch as the model is done with them, in no given order.
+        """Every row once, batch by batch, in any order.
 
-        On a GPU one batch is ahead of what is handed out, so that it works while the caller does;
-        what is done is not held back. Raises
+        On a GPU one batch is computed while the caller works on the one before. Raises
         `NumericsError` that names the row, and variant, of a feature that is not finite, and
         `VLMError` where memory does not suffice for a single row.
         """
@@ -115,16 +114,16 @@ class Encoder:
         for batch in self._batches(rows):
             for submitted in self._submitted(batch):
                 ahead.append(submitted)
-                keep = 0 if all(each.done for each in submitted[1]) else 1
+                keep = 0 if all(part.done for part in submitted[1]) else 1
                 while len(ahead) > keep:
                     yield from self._finished(ahead.pop(0))
         for submitted in ahead:
             yield from self._finished(submitted)
 
     def _batches(self, rows: Iterable[ReadyRow]) -> Iterator[list[ReadyRow]]:
-        """Full batches of equal shape as they come together, at last what is left of each shape.
+        """Full batches of equal shape as they come together; at the end the rest of each shape.
 
-        So that waiting rows stay few, the largest group goes when many shapes wait.
+        When rows of many shapes wait, the largest group goes, so that few rows wait.
         """
         waiting: dict[TokenLayout, list[ReadyRow]] = defaultdict(list)
         for row in rows:
@@ -138,11 +137,11 @@ class Encoder:
 
     @property
     def _rows(self) -> int:
-        """Whole rows a batch: at least one, whose variants may then take several passes."""
+        """Rows a batch: at least one, whose variants may take several passes."""
         return max(1, self.size.current // self._variants)
 
     def _submitted(self, rows: list[ReadyRow]) -> Iterator[_Submitted]:
-        """The rows in as many batches as the batch size makes of them."""
+        """The rows in batches of at most the batch size."""
         while rows:
             batch = rows[: self._rows]
             every = [prepared for row in batch for prepared in row.variants]
@@ -163,7 +162,7 @@ class Encoder:
         try:
             features = [part.result()[0] for part in passes]
         except NumericsError:
-            for row in rows:  # alone, the one that is not finite names itself
+            for row in rows:  # computed alone, the row that is not finite is named
                 yield [row], _stored([row], [self._alone(row, v) for v in range(self._variants)])
             return
         seconds = sum(part.model_s for part in passes)
@@ -188,5 +187,5 @@ def _stored(rows: list[ReadyRow], features: list[torch.Tensor]) -> NDArray[Any]:
 
 
 def _out_of_memory(error: RuntimeError) -> bool:
-    """CUDA has an exception of its own; the CPU allocator says it in words."""
+    """CUDA raises an exception of its own; the CPU allocator only says it in its message."""
     return isinstance(error, torch.OutOfMemoryError) or "can't allocate memory" in str(error)

@@ -1,4 +1,4 @@
-"""Which rows of a build become golden rows, and their frames: of the store before, or decoded."""
+"""Choose the golden rows of a build; their frames come from the store before, or are decoded."""
 
 from collections.abc import Iterator
 
@@ -6,8 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.base.golden import spread
-from pipeline.extract.engine import RowFrames, row_frames
+from pipeline.data.row_range import RowFrames
 from pipeline.extract.plan import Say, StorePlaces
+from pipeline.extract.rows import row_frames
 from pipeline.extract.survey import Survey
 from pipeline.store import GoldenFrames, StoreBuild
 from pipeline.store.golden import carried_golden
@@ -18,9 +19,9 @@ from pipeline.vlm.preparation import Preparer
 def keep_golden(build: StoreBuild, surveyed: Survey, places: StorePlaces, say: Say) -> None:
     """Write the golden rows of a build whose rows are all there: at most four, evenly spread.
 
-    Those that the store before has are taken from it, the others are decoded. Where the decoder of
-    today gives other pixels than a row was computed from, that row is left out and `say` told.
-    Raises `RecordingError` where a recording has gone, and `DiskFull`.
+    Those that the store before has are taken from it, the others are decoded. A row whose frames
+    now decode to other pixels than it was computed from is left out, and `say` prints it. Raises
+    `RecordingError` where a recording is gone, and `DiskFull`.
     """
     frames = row_frames(build, surveyed)
     views = np.isfinite(frames.frame_time).sum(axis=1)
@@ -37,9 +38,9 @@ def keep_golden(build: StoreBuild, surveyed: Survey, places: StorePlaces, say: S
 
 
 def _carried(build: StoreBuild, surveyed: Survey, places: StorePlaces) -> dict[int, GoldenFrames]:
-    """By row, what the store before, and the one before it, have: they prove themselves.
+    """The golden frames, by row, of the store before and of the one before it.
 
-    Of one under repair as well: what is damaged does not prove itself.
+    Of a store under repair, too: damaged frames do not give their key and are left out.
     """
     keys = build.files(KEYS).read(0, build.specs[KEYS].shape[0])
     stores = [] if places.finished is None else [places.target]

@@ -1,9 +1,8 @@
-"""What an extraction would do, and why; said before anything is done.
+"""What an extraction will do, and why, told before anything is done.
 
 `StorePlaces` is what lies at the place of a store and beside it, and what of that may be used.
 """
 
-import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing
 from functools import cached_property
@@ -13,7 +12,7 @@ from typing import Any
 
 from pipeline.base.config import setting
 from pipeline.base.differences import describe, differences
-from pipeline.base.digests import ContentDigests, joint_digest
+from pipeline.base.digests import ContentDigests
 from pipeline.base.durable import KEPT, free_bytes, previous_path
 from pipeline.base.errors import StoreIncomplete, StoreMismatch
 from pipeline.base.format import duration, size
@@ -25,7 +24,6 @@ from pipeline.store.paths import MERGED, STORE, is_store
 from pipeline.store.schema import ArraySpec, read_specs
 
 Say = Callable[[str], None]
-_DECIDES_SPEED = ("weights", "adapter", "processor", "compute_dtype", "variants")
 
 # Entries of a feature spec that a message lists.
 _SHOWN = 6
@@ -196,7 +194,7 @@ def _contents(store: Path) -> list[str] | None:
 
 
 def spec_differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
-    """What differs between two feature specs, without all that follows from it."""
+    """What differs between two feature specs, without entries that only follow from others."""
     differing = differences(before, now)
     first = {
         place: values
@@ -214,7 +212,7 @@ def plan_lines(
     sources: Sequence[RowSource],
     known: int,
 ) -> list[str]:
-    """What there is to do, for people, where so many rows are known.
+    """What the extraction will do, line by line; `known` rows need no model.
 
     `sources` are stores and builds of the same feature spec.
     """
@@ -232,7 +230,7 @@ def plan_lines(
     else:
         reasons = _reasons(surveyed, before, build.specs)
     rows, variants = build.specs[FEATURES].shape[0], surveyed.spec.variants
-    left, rows_per_s = rows - known, digests.rate(rate_name(surveyed))
+    left, rows_per_s = rows - known, digests.rate(surveyed.rate_name)
     if not left:
         time = "none, the model is not needed"
     elif rows_per_s is None:
@@ -253,17 +251,6 @@ def plan_lines(
     ]
 
 
-def rate_name(surveyed: Survey) -> str:
-    """Under which name the speed of this model on these devices is remembered.
-
-    Whatever else of the spec changes, such as prompt, slots or names of views, costs little.
-    """
-    extract, spec = surveyed.params.extract, surveyed.spec.attrs()
-    by = f" on {extract.workers}" if extract.workers != 0 else ""
-    alike = {name: spec.get(name) for name in _DECIDES_SPEED} | {"views": len(spec["views"])}
-    return f"{joint_digest(json.dumps(alike, sort_keys=True))} {extract.device}{by}"
-
-
 def store_bytes(specs: dict[str, ArraySpec]) -> int:
     """Bytes that a store's rows take."""
     return sum(spec.data_bytes for spec in specs.values())
@@ -272,7 +259,7 @@ def store_bytes(specs: dict[str, ArraySpec]) -> int:
 def _reasons(
     surveyed: Survey, before: RowSource | None, specs: dict[str, ArraySpec]
 ) -> Iterator[str]:
-    """Why the store that is there, if any, will not do."""
+    """Why the present store, if any, does not suffice."""
     if before is None:
         yield "there is no store yet"
         return
@@ -281,7 +268,7 @@ def _reasons(
     digests = {text.digest for text in before.texts}
     changed = [episode for episode in surveyed.episodes if episode.digest not in digests]
     here = {episode.digest for episode in surveyed.episodes}
-    again = {episode.content for episode in changed}  # said as the new ones are
+    again = {episode.content for episode in changed}  # counted among the new ones
     gone = sum(text.digest not in here and text.content not in again for text in before.texts)
     if changed:
         what = "files, how these are read, instruction, name, place, action_hz or vlm_reuse_count"
@@ -301,7 +288,7 @@ def _reasons(
 
 
 def _warnings(surveyed: Survey, before: RowSource | None, missing: int) -> Iterator[str]:
-    """What may not be meant, each with the way out."""
+    """What the user may not intend, each with the way out."""
     params, recordings, views = surveyed.params, surveyed.recordings, surveyed.spec.views
     known = before.said.feature_spec.views if before else []
     if known and (added := set(views) - set(known)):
@@ -341,7 +328,7 @@ def _warnings(surveyed: Survey, before: RowSource | None, missing: int) -> Itera
 def count_known(
     checked: Sequence[CheckedEpisode], surveyed: Survey, sources: Sequence[RowSource]
 ) -> int:
-    """How many rows of these episodes are in `sources`, as far as can be told without a frame."""
+    """How many rows of these episodes are in `sources`, judged by frame times alone."""
     count = 0
     for episode in checked:
         of = episode.said["content"], episode.said["instruction"]

@@ -19,22 +19,21 @@ from pipeline.base.errors import StoreMismatch
 from pipeline.base.format import capped
 from pipeline.data.row_range import RowFrames
 from pipeline.extract.encoder import Encoder
-from pipeline.extract.engine import ReadyRow, RowPreparation
+from pipeline.extract.rows import ReadyRow, RowPreparation
 from pipeline.extract.survey import survey
 from pipeline.store import FEATURES, FeatureStore
 from pipeline.store.writer import environment_runs
 from pipeline.vlm.deviation import slot_deviations, tolerance_of
-from pipeline.vlm.preparation import Preparer
 from pipeline.vlm.qwen import FrozenVLM
 
 
 @dataclass(frozen=True)
 class Deviation:
-    """How far one row of today is from the stored one.
+    """How far a row that was computed now is from the stored one.
 
-    `relative` is to the root mean square of the stored slot, the largest of all variants and slots,
-    which is in `slot`, counted over both. `same_pixels` where the key is that of the store: the
-    frames decode to the same pixels. `where` is recording and row.
+    `relative` is the largest deviation of all variants and slots, as a share of the root mean
+    square of the stored slot; `slot` is its number, counted over both. `same_pixels`: the frames
+    decode to the pixels that the stored key is of. `where` is recording and row.
     """
 
     row: int
@@ -54,10 +53,10 @@ class Deviation:
 
 @dataclass(frozen=True)
 class Reextraction:
-    """What came of it; of each row, the largest relative deviation first.
+    """The deviations of all computed rows, the largest first.
 
-    `unchecked` are ids of episodes whose recordings are not there as they were, `environment` is
-    where software or hardware of today is not that of the rows.
+    `unchecked` are ids of episodes whose recordings changed or are gone; `environment` lists where
+    the present software or hardware is not that of the rows.
     """
 
     deviations: tuple[Deviation, ...]
@@ -67,11 +66,11 @@ class Reextraction:
 
     @property
     def beyond(self) -> list[Deviation]:
-        """Rows that deviate more than is tolerated; a NaN always does."""
+        """Rows beyond the tolerance; a NaN always is."""
         return [row for row in self.deviations if not row.relative <= self.tolerance]
 
     def lines(self) -> list[str]:
-        """For people."""
+        """The result in lines for people."""
         gone = "cannot be checked, its recording changed or is gone: "
         unchecked = capped([gone + episode for episode in self.unchecked], "episodes")
         if not self.deviations:
@@ -86,15 +85,15 @@ class Reextraction:
         ]
 
     def refusals(self) -> list[str]:
-        """For people: the rows beyond the tolerance."""
+        """The rows beyond the tolerance, in lines for people."""
         return capped([str(row) for row in self.beyond], "rows beyond the tolerance")
 
 
 def reextract(path: Path, params: Params, say: Callable[[str], None]) -> Reextraction:
     """Compute `verify.reextract` random rows of a store again, each with all its variants.
 
-    From the recordings that the store was made of; the rows of episodes whose recordings changed
-    are left out and named. Raises `StoreMismatch` where the params describe features of another
+    Reads the recordings that the store was made of; episodes whose recordings changed are left out
+    and named. Raises `StoreMismatch` where the params describe features of another
     kind than the store's, and `NumericsError` where a feature is NaN or infinite.
 
     The tolerance is `verify.tolerance`, else that of the coarser of compute and storage dtype.
@@ -126,7 +125,7 @@ def reextract(path: Path, params: Params, say: Callable[[str], None]) -> Reextra
     recordings = {episode.index: today[episode.digest] for episode in known}
     vl_start, frame_time = (store.array(name) for name in ("episode/vl_start", "vl/frame_time"))
     frames = RowFrames(recordings, vl_start, frame_time, spec.views)
-    preparation = RowPreparation(Preparer(params.vlm, spec), spec, ())
+    preparation = RowPreparation(surveyed, ())
     prepared = (row for part in frames.ranges(rows) for row in preparation.prepare(part))
     ready = (row for row in prepared if isinstance(row, ReadyRow))  # all: no other store is known
     encoder = Encoder(vlm, params.extract.batch_size, spec.variants)
@@ -144,7 +143,7 @@ def reextract(path: Path, params: Params, say: Callable[[str], None]) -> Reextra
 
 
 def _compare(store: FeatureStore, row: ReadyRow, features: NDArray[Any]) -> Deviation:
-    """The stored row against the features (variant x slot, dim) of today, both as stored."""
+    """Compare the stored row with features (variant x slot, dim) of now, both as stored."""
     apart = slot_deviations(widen(store.array(FEATURES)[row.row]), widen(features))
     slot = apart.worst
     same_pixels = store.array("vl/key")[row.row].tobytes() == row.key

@@ -12,7 +12,7 @@ from pipeline.base.device import resolve_device
 from pipeline.base.digests import ContentDigests, ledger_path
 from pipeline.base.format import capped
 from pipeline.data.timeline import rate_notes
-from pipeline.extract.engine import ExtractionReport, fill
+from pipeline.extract.engine import Executor, ExtractionReport, compute_here, fill
 from pipeline.extract.golden import keep_golden
 from pipeline.extract.layout import build_arrays, check_readable, check_space, lay_out
 from pipeline.extract.plan import Say, StorePlaces, count_known, plan_lines, row_sources
@@ -93,7 +93,8 @@ def _resume(
             say(line)
         if surveyed.params.extract.plan:
             return None
-        report = fill(build, surveyed, row_sources(places.known, surveyed), digests, missing)
+        known = row_sources(places.known, surveyed)
+        report = fill(build, surveyed, known, digests, missing, _executor(surveyed))
         keep_golden(build, surveyed, places, say)
     places.put_in_place(build, surveyed, say)
     return report
@@ -131,10 +132,19 @@ def _begin(
         places = StorePlaces(places.target)
         known = row_sources(places.known, surveyed)
         lay_out(build, checked, surveyed, known)
-        report = fill(build, surveyed, known, digests, rows)
+        report = fill(build, surveyed, known, digests, rows, _executor(surveyed))
         keep_golden(build, surveyed, places, say)
     places.put_in_place(build, surveyed, say)
     return report
+
+
+def _executor(surveyed: Survey) -> Executor:
+    """Where rows are computed: in this process, or by the dask workers of `extract.workers`."""
+    if surveyed.params.extract.workers == 0:
+        return compute_here
+    from pipeline.extract.cluster import compute_on_cluster  # dask: a second to import
+
+    return compute_on_cluster
 
 
 def _survey_lines(surveyed: Survey) -> Iterator[str]:

@@ -1,15 +1,16 @@
-"""Which episodes there are and what they are, and whether each can be used.
+"""Which episodes there are, what they hold, and whether each can be used.
 
-A survey reads no sensor and decodes no frame. Its plan digest names everything that decides what a
-store holds: where a finished store carries the same, there is nothing to do. `check_episodes` then
-reads every episode whole, before the first byte is written, so that all that is wrong is said at
-once and before anything expensive runs.
+A survey reads no sensor and decodes no frame. Its plan digest covers everything that decides what a
+store holds: where a finished store has the same, there is nothing to do. `check_episodes` then
+reads every episode whole, before the first byte is written, so that everything that is wrong is
+listed at once, before anything expensive runs.
 """
 
+import json
 import os
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -33,18 +34,21 @@ _STORED = Border(
     RecordingError,
     "No store could be read with it: rename or shorten it there, or leave the episode out.",
 )
-"""How what a store is to say of an episode is refused, by the models that will read it."""
+"""Refuses an episode whose texts the readers of a store would refuse."""
+
+_DECIDES_SPEED = ("weights", "adapter", "processor", "compute_dtype", "variants")
 
 MOST_EPISODES = 10
-"""That cannot be used and are shown; the rest is counted."""
+"""How many unusable episodes a message lists; the rest is counted."""
 
 
 @dataclass(frozen=True)
 class SurveyedEpisode:
-    """A recording and what the store says of it, its digests too."""
+    """A recording, and the texts that the store keeps of it, its digests among them."""
 
     recording: Recording
     text: Mapping[str, str]
+    views: tuple[str, ...]
 
     @property
     def content(self) -> str:
@@ -53,16 +57,16 @@ class SurveyedEpisode:
 
     @property
     def digest(self) -> str:
-        """Digest of content and of everything else that decides what the store says of it."""
+        """Digest of content and of everything else that decides its part of the store."""
         return self.text["digest"]
 
 
 @dataclass(frozen=True)
 class Survey:
-    """What is to be in the store.
+    """What the store is to hold.
 
-    A data set's metadata list the `missing`, which are not among its files. `plan` is the digest of
-    all that decides what the store holds.
+    `missing` names episodes that a data set's metadata list and its files lack. `plan` is the
+    digest of everything that decides what the store holds.
     """
 
     params: Params
@@ -88,10 +92,21 @@ class Survey:
         """The content digests of the episodes."""
         return {episode.content for episode in self.episodes}
 
+    @property
+    def rate_name(self) -> str:
+        """The name under which the speed of this model on these devices is remembered.
+
+        What else differs between specs, such as prompt, slots or names of views, costs little.
+        """
+        extract, spec = self.params.extract, self.spec.attrs()
+        by = f" on {extract.workers}" if extract.workers != 0 else ""
+        alike = {name: spec.get(name) for name in _DECIDES_SPEED} | {"views": len(spec["views"])}
+        return f"{joint_digest(json.dumps(alike, sort_keys=True))} {extract.device}{by}"
+
 
 @dataclass(frozen=True)
 class CheckedEpisode(EpisodeRows):
-    """An episode that was read whole and found sound; its streams are let go again."""
+    """An episode that was read whole and is sound; its streams are let go again."""
 
     recording: Recording
     embodiment: Embodiment
@@ -103,57 +118,63 @@ def survey(params: Params, digests: ContentDigests) -> Survey:
     With `data.on_bad_episode: skip`, episodes that an earlier check found bad are left out. Raises
     `RecordingError` when no episode is usable, and whatever a source as a whole is refused for.
     """
-    data, extract = params.data, params.extract
+    data = params.data
     opened = open_recordings(data.sources, data.root, data.views)
     rotation = choose_action_rotation(data.action_rotation, opened.recordings)
-    episodes: list[SurveyedEpisode] = []
-    bad = list(opened.bad)
-    views: set[str] = set()
+    episodes, bad = list[SurveyedEpisode](), list(opened.bad)
     for recording in tqdm(opened.recordings, "survey", unit="episode", disable=None, leave=False):
         try:
             episode = _surveyed(recording, data, rotation, digests)
             if data.on_bad_episode == "skip" and (reason := digests.bad(episode.digest)):
                 raise RecordingError(reason)
-            views |= set(recording.view_names())
             episodes.append(episode)
         except RecordingError as error:
             bad.append(BadEpisode(recording.source, recording.path, str(error)))
     if not episodes:
         _refuse_bad(bad, of=len(bad))
-    spec = feature_spec(params.vlm, extract.dtype, sorted(views), digests.of, digests.text)
-    plan = joint_digest(
+    spec, plan = _spec_and_plan(params, episodes, digests)
+    return Survey(params, tuple(episodes), opened.missing, tuple(bad), spec, rotation, plan)
+
+
+def _spec_and_plan(
+    params: Params, episodes: Sequence[SurveyedEpisode], digests: ContentDigests
+) -> tuple[FeatureSpec, str]:
+    """The feature spec and the plan digest of a store of these episodes, which decide its views."""
+    data, extract = params.data, params.extract
+    views = sorted({view for episode in episodes for view in episode.views})
+    spec = feature_spec(params.vlm, extract.dtype, views, digests.of, digests.text)
+    return spec, joint_digest(
         spec.digest,
         extract.sensor_dtype,
         *(["rate"] if data.action_hz is None else []),  # which earlier stores did not keep
         repr([(source.name, source.action_kind) for source in data.sources]),
         *(episode.digest for episode in episodes),
     )
-    return Survey(params, tuple(episodes), opened.missing, tuple(bad), spec, rotation, plan)
 
 
 def sound_episodes(
     surveyed: Survey, digests: ContentDigests
 ) -> tuple[Survey, list[CheckedEpisode]]:
-    """Every sound episode; the survey again without those that have to be skipped.
+    """Every sound episode, and the survey without those that have to be skipped.
 
-    A bad episode must decide neither the views nor how actions are derived. Raises as
-    `check_episodes` does.
+    Raises as `check_episodes` does.
     """
-    checked, bad = check_episodes(surveyed)
-    if not bad:
+    checked, failed = check_episodes(surveyed)
+    if not failed:
         return surveyed, checked
-    for episode, reason in bad:
-        digests.note_bad(episode.digest, reason)
-    again = survey(surveyed.params, digests)
-    if again.action_rotation == surveyed.action_rotation:
-        kept = {episode.digest for episode in again.episodes}
-        return again, [episode for episode in checked if episode.said["digest"] in kept]
-    return sound_episodes(again, digests)
+    for episode, bad in failed:
+        digests.note_bad(episode.digest, bad.reason)
+    unusable = {episode.digest for episode, _ in failed}
+    sound = [episode for episode in surveyed.episodes if episode.digest not in unusable]
+    spec, plan = _spec_and_plan(surveyed.params, sound, digests)
+    bad = (*surveyed.bad, *(bad for _, bad in failed))
+    again = replace(surveyed, episodes=tuple(sound), bad=bad, spec=spec, plan=plan)
+    return again, [episode for episode in checked if episode.said["digest"] not in unusable]
 
 
 def check_episodes(
     surveyed: Survey,
-) -> tuple[list[CheckedEpisode], list[tuple[SurveyedEpisode, str]]]:
+) -> tuple[list[CheckedEpisode], list[tuple[SurveyedEpisode, BadEpisode]]]:
     """Read and check every episode; returns the sound ones, and the others with the reason.
 
     Raises one `RecordingError` that lists all that cannot be used, unless
@@ -162,16 +183,14 @@ def check_episodes(
     """
     preparer = Preparer(surveyed.params.vlm, surveyed.spec)
     sound: list[CheckedEpisode] = []
-    failed: list[tuple[SurveyedEpisode, str]] = []
+    failed: list[tuple[SurveyedEpisode, BadEpisode]] = []
     for episode in tqdm(surveyed.episodes, "check", unit="episode", disable=None, leave=False):
         try:
             sound.append(_checked(episode, surveyed, preparer))
         except RecordingError as error:
-            failed.append((episode, str(error)))
-    bad = [
-        *surveyed.bad,
-        *(BadEpisode(e.recording.source, e.recording.path, reason) for e, reason in failed),
-    ]
+            of = episode.recording
+            failed.append((episode, BadEpisode(of.source, of.path, str(error))))
+    bad = [*surveyed.bad, *(bad for _, bad in failed)]
     if bad and (surveyed.params.data.on_bad_episode == "stop" or not sound):
         _refuse_bad(bad, of=len(sound) + len(bad))
     embodiment_of(sound)
@@ -193,9 +212,9 @@ def embodiment_of(checked: Sequence[CheckedEpisode]) -> Embodiment:
 def _refuse_rates(checked: Sequence[CheckedEpisode]) -> None:
     """Raise `StoreMismatch` where recorded rows, as ticks of one store, have no or two rates."""
     rates = sorted(
-        (one.ticks.recorded_hz, f"{one.source!r} ({one.recording.path})")
-        for one in checked
-        if one.ticks.recorded_hz
+        (episode.ticks.recorded_hz, f"{episode.source!r} ({episode.recording.path})")
+        for episode in checked
+        if episode.ticks.recorded_hz
     )
     if not rates:
         raise StoreMismatch(
@@ -252,13 +271,43 @@ def _surveyed(
         "path": path.as_posix(),
         "format": recording.format,
         "instruction": recording.instruction,
-        "content": content_digest(recording, digests.of),
+        "content": _content(recording, digests),
     }
     group = recording.group
-    said = [text["id"], text["format"], text["instruction"], text["path"]]
+    parts = [text["id"], text["format"], text["instruction"], text["path"]]
     if group is not None:
-        said.append(group)
+        parts.append(group)
         text["group"] = group
     decides = repr((data.action_hz, data.vlm_reuse_count, rotation))
-    digest = joint_digest(text["content"], recording.source, *said, decides)
-    return SurveyedEpisode(recording, text | {"digest": digest})
+    digest = joint_digest(text["content"], recording.source, *parts, decides)
+    return SurveyedEpisode(recording, text | {"digest": digest}, tuple(recording.view_names()))
+
+
+_CONTENT_VERSION = 1
+"""To be raised whenever `content_digest` changes: results of before are remembered."""
+
+
+def _content(recording: Recording, digests: ContentDigests) -> str:
+    """The content digest of a recording, remembered by path, size and mtime of all its files.
+
+    One entry an episode: to look up each of its files would take longer than their `stat`.
+    """
+    listed = [str(_CONTENT_VERSION), recording.identity(), str(recording.path)]
+    folders: dict[str, str] = {}
+    places: dict[str, str] = {}
+    try:
+        for file in map(str, recording.files()):
+            status = os.stat(file)  # noqa: PTH116, a tenth of the time of a path's
+            folder, _, name = file.rpartition("/")
+            if folder not in folders:
+                folders[folder] = os.path.realpath(folder)
+            places[file] = f"{folders[folder]}/{name}"
+            what = f"{status.st_mode} {status.st_size} {status.st_mtime_ns}"
+            listed.append(f"{what} {places[file]}")
+    except OSError:
+        return content_digest(recording, digests.of)  # which names the file
+
+    def of_place(file: Path) -> str:
+        return digests.of(Path(places[str(file)]))
+
+    return digests.text(joint_digest(*listed), lambda: content_digest(recording, of_place))

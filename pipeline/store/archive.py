@@ -1,14 +1,13 @@
 """A compressed, sharded, checksummed copy of a store, for keeping and sharing.
 
-A plain zarr v3 group of the same arrays under the same names, but in few, large files (shards), in
-which inner chunks of some MB are compressed and checksummed one by one, so that a part can be read
-without the whole. A shard holds whole chunk files of the store: both copies are read and written
-once, in order, with a shard in memory at a time.
+A plain zarr v3 group with the same arrays under the same names, but in few, large files (shards),
+in which inner chunks of some MB are compressed and checksummed one by one, so that a part can be
+read without the whole. A shard holds whole chunk files of the store: both copies are read and
+written once, in order, with one shard in memory at a time.
 
 Its root's attributes are those of the store and a manifest: the text of every `zarr.json` of the
-store, among them its seal with the checksum of each chunk file. That is what proves an archive and
-rebuilds the store to the byte. The manifest is written last: a folder that has one is a complete
-archive.
+store, among them its seal with the checksum of each chunk file. That proves an archive and rebuilds
+the store to the byte. The manifest is written last: a folder that has one is a complete archive.
 """
 
 import hashlib
@@ -16,7 +15,7 @@ import json
 import math
 import re
 import shutil
-from collections.abc import Generator, Mapping, Sequence
+from collections.abc import Generator, Mapping
 from contextlib import closing, contextmanager
 from dataclasses import replace
 from itertools import count
@@ -38,24 +37,15 @@ from pipeline.base.durable import disk_full_named, put_in_place, sync
 from pipeline.base.errors import PipelineError, StoreIncomplete, StoreMismatch
 from pipeline.base.ownership import OutputKind, begin_folder, remove_folder
 from pipeline.store.border import Group, Length, StoreAttributes, store_border
-from pipeline.store.chunks import (
-    Seal,
-    check_row_checksums,
-    check_seal,
-    check_trailers,
-    read_rows,
-    sealed_trailer,
-    trailers,
-)
+from pipeline.store.chunks import Seal, check_seal, check_trailers, read_rows, sealed_trailer
 from pipeline.store.golden import GOLDEN, read_golden
 from pipeline.store.lock import build_lock
 from pipeline.store.metadata import ATTRIBUTE as METADATA_DIGEST
-from pipeline.store.metadata import SEAL, metadata_damage
+from pipeline.store.metadata import SEAL
 from pipeline.store.paths import (
     STORE,
     group_attributes,
     inode_of,
-    laid_out_attributes,
     part_path,
     read_plan,
     recover,
@@ -65,8 +55,6 @@ from pipeline.store.reader import FeatureStore
 from pipeline.store.repair_hints import extract_command, gc_command
 from pipeline.store.schema import (
     ARRAY_NAMES,
-    CHECKSUMS,
-    FEATURES,
     GROUPS,
     KEYS,
     TRAILER_BYTES,
@@ -80,57 +68,62 @@ from pipeline.store.writer import StoreBuild, sync_folders
 
 _SCHEMA = 2
 _ZARR_JSON = "zarr.json"
-_MANIFEST = "archive"
-"""The attribute of the root that holds the manifest."""
-SHARD_BYTES = 256 * 2**20
-"""Raw bytes of a shard at most, where one chunk file of the store is not larger. With
-`INNER_BYTES` part of the format: an archive of other sizes has another `_SCHEMA`."""
-INNER_BYTES = 4 * 2**20
-"""Raw bytes of an inner chunk at most, where one row is not larger."""
-_OF_A_STORE = ("schema", "plan", METADATA_DIGEST, SEAL)
-"""Attributes of the root that would be false of an archive."""
 
+# The attribute of the root that holds the manifest.
+_MANIFEST = "archive"
+
+# Attributes of a store's root that would be false of an archive.
+_OF_A_STORE = ("schema", "plan", METADATA_DIGEST, SEAL)
+
+# Raw bytes of a shard and of an inner chunk at most, where one chunk file of the store, or one row,
+# is not larger. Part of the format: an archive of other sizes has another `_SCHEMA`.
+SHARD_BYTES = 256 * 2**20
+INNER_BYTES = 4 * 2**20
+
+# Where a shard says that a piece of zeros begins.
+_NO_PIECE = 2**64 - 1
+
+# Names of files that a store can have: none climbs out of it.
+_ARRAY = rf"^({'|'.join(ARRAY_NAMES)})$"
+_VIEW = r"golden/[0-9]+/[^/.\x00][^/\x00]*"
+_FRAME = rf"^{_VIEW}/c/0/0/0$"
+_METADATA = rf"^(({'|'.join((*GROUPS, *ARRAY_NAMES))}|golden|golden/[0-9]+|{_VIEW})/)?zarr\.json$"
 
 _BORDER = Border(
     StoreIncomplete,
     "Nothing was restored from it; take another copy of the archive, or make it anew with "
     "stages.archive where the store still is.",
 )
-_NO_PIECE = 2**64 - 1
-"""Where a shard says that a piece of zeros begins."""
-_ARRAY = rf"^({'|'.join(ARRAY_NAMES)})$"
-_VIEW = r"golden/[0-9]+/[^/.\x00][^/\x00]*"
-_FRAME = rf"^{_VIEW}/c/0/0/0$"
-_METADATA = rf"^(({'|'.join((*GROUPS, *ARRAY_NAMES))}|golden|golden/[0-9]+|{_VIEW})/)?zarr\.json$"
-"""Names of files that a store can have: none climbs out of it."""
 _Model = TypeVar("_Model")
 
 
 class ArchivedArray(Document):
-    """What the manifest says of one array."""
+    """One array in the manifest.
+
+    `raw_bytes` are those of its rows, `shard_bytes` the size of each shard's file: 0 where all is
+    zero, for which zarr writes no file. `metadata` is the digest of its metadata in the archive.
+    """
 
     codec: Text
     raw_bytes: Length
-    """Of its rows."""
     shard_bytes: list[Length]
-    """Size of each shard's file; 0 where all is zero, for which zarr writes no file."""
     metadata: Text
-    """Digest of this array's metadata in the archive."""
 
 
 class Manifest(Document):
-    """The content of an archive."""
+    """The content of an archive.
+
+    `metadata` has the text of every `zarr.json` of the store by its path, `golden` the digest of
+    each chunk file of its golden rows, which are copied as they are.
+    """
 
     metadata: dict[Annotated[str, Field(pattern=_METADATA)], str]
-    """Every `zarr.json` of the store, as text, by its path."""
     arrays: dict[Annotated[str, Field(pattern=_ARRAY)], ArchivedArray] = Field(
         min_length=len(ARRAY_NAMES)
     )
     golden: dict[Annotated[str, Field(pattern=_FRAME)], Text] = Field(default_factory=dict)
-    """The digest of each chunk file of the store's golden rows, by its path in it; copied as it is.
-    """
 
-    def said(self, archive: Path) -> StoreAttributes:
+    def attributes(self, archive: Path) -> StoreAttributes:
         """The root attributes of the store. Raises `StoreIncomplete` where they are wrong."""
         return StoreAttributes.of(archive, self._parsed(archive, "", Group).attributes, _BORDER)
 
@@ -138,10 +131,10 @@ class Manifest(Document):
         """The arrays of the store. Raises `StoreIncomplete` where their metadata are wrong."""
         specs: dict[str, ArraySpec] = {}
         for name in self.arrays:
-            found = self._parsed(archive, name, dict[str, Any])
+            document = self._parsed(archive, name, dict[str, Any])
             where = f"{archive}, {name}/zarr.json of the store"
-            specs[name] = array_of(found, name, where, _BORDER)
-        check_agreement(archive, self.said(archive), specs, _BORDER)
+            specs[name] = array_of(document, name, where, _BORDER)
+        check_agreement(archive, self.attributes(archive), specs, _BORDER)
         return specs
 
     def _parsed(self, archive: Path, place: str, model: type[_Model]) -> _Model:
@@ -175,10 +168,10 @@ def read_manifest(path: Path) -> Manifest:
     """
     document = _manifest_document(path)
     if document is None:
-        found = f"no manifest in its {_ZARR_JSON}" if path.exists() else "nothing"
+        instead = f"no manifest in its {_ZARR_JSON}" if path.exists() else "nothing"
         raise StoreMismatch(
-            f"{path}: expected an archive, found {found}. Name one with archive.output, or make it "
-            "with stages.archive."
+            f"{path}: expected an archive, found {instead}. Name one with archive.output, or make "
+            "it with stages.archive."
         )
     if document.get("schema") != _SCHEMA:
         raise StoreMismatch(
@@ -193,9 +186,9 @@ def read_manifest(path: Path) -> Manifest:
 def archive(store: Path, output: Path, level: int, threads: int) -> Manifest | None:
     """Write the archive of a finished store to `output` and prove that it gives the store back.
 
-    `level` is zstd's, 1 to 22. The store is checked before, and every shard read back after it was
-    written. What is written lies in `<output>.part` until it is complete; stopped or killed, it is
-    begun anew. Returns None where an archive of this very store is there already.
+    `level` is zstd's, 1 to 22. The store is checked first, and every shard is read back once it is
+    written. The archive is written in `<output>.part`; after a kill it is begun anew. Returns None
+    where an archive of this very store is there already.
 
     Raises `StoreIncomplete` naming the file where the store is not finished or is damaged,
     `StoreMismatch` where something else lies at `output`, `StoreLocked` and `DiskFull`.
@@ -212,20 +205,20 @@ def archive(store: Path, output: Path, level: int, threads: int) -> Manifest | N
         check_trailers(store)
         read_golden(store, opened.array(KEYS))
         with _begun(output, ARCHIVE, threads) as part:
-            manifest = _write(store, part, level)
+            manifest = _write(store, part, level, opened.attrs[SEAL])
         put_in_place(part, output, ARCHIVE)
         return manifest
 
 
 def restore(archive: Path, target: Path, threads: int) -> None:
-    """Make the store that an archive was made from, equal in every byte of every file.
+    """Make the store of an archive again, equal in every byte of every file.
 
-    Built in `<target>.part` like any store and renamed when complete; stopped or killed, it is
+    It is built in `<target>.part` like any store and renamed when complete; after a kill it is
     begun anew. Where that very store is there already, nothing is done.
 
     Raises `StoreIncomplete` naming file and array where the archive is damaged, `StoreMismatch`
     where another store lies at `target` or is being built there, `ConfigError` where something
-    else does, `StoreLocked` and `DiskFull`.
+    else lies there, `StoreLocked` and `DiskFull`.
     """
     manifest = read_manifest(archive)
     with build_lock(target):
@@ -256,16 +249,16 @@ def _begun(target: Path, kind: OutputKind, threads: int) -> Generator[Path]:
         raise
 
 
-def _write(store: Path, part: Path, level: int) -> Manifest:
+def _write(store: Path, part: Path, level: int, seal: Seal) -> Manifest:
     """Everything of an archive, its manifest last, all of it on the disk."""
     inode, specs, metadata = inode_of(store), read_specs(store), _read_metadata(store)
-    of_groups = {name: group_attributes(store / name) for name in ("", *GROUPS)}
-    of_groups[""] = {k: v for k, v in of_groups[""].items() if k not in _OF_A_STORE}
-    for name, attributes in of_groups.items():
-        zarr.create_group(part, path=name, attributes=attributes)
+    root = {k: v for k, v in group_attributes(store).items() if k not in _OF_A_STORE}
+    for name in GROUPS:
+        zarr.create_group(part, path=name, attributes=group_attributes(store / name))
     with _progress("archive", sum(spec.data_bytes for spec in specs.values())) as progress:
         arrays = {
-            name: _write_array(store, part, spec, level, progress) for name, spec in specs.items()
+            name: _write_array(store, part, spec, level, seal, progress)
+            for name, spec in specs.items()
         }
     golden = _golden_digests(store)
     _write_metadata(part, {n: text for n, text in metadata.items() if n.startswith(GOLDEN)})
@@ -274,30 +267,22 @@ def _write(store: Path, part: Path, level: int) -> Manifest:
     manifest = Manifest(metadata=metadata, arrays=arrays, golden=golden)
     document = {"schema": _SCHEMA, **manifest.model_dump(mode="json")}
     document["digest"] = _digest_of(document)
-    zarr.open_group(part, mode="r+").attrs.put({**of_groups[""], _MANIFEST: document})
+    zarr.open_group(part, mode="a").attrs.put({**root, _MANIFEST: document})
     sync_folders(part)
     return manifest
 
 
 def _write_array(
-    store: Path, part: Path, spec: ArraySpec, level: int, progress: "tqdm[Any]"
+    store: Path, part: Path, spec: ArraySpec, level: int, seal: Seal, progress: "tqdm[Any]"
 ) -> ArchivedArray:
-    """Copy an array shard by shard; each is read back before the next."""
+    """Copy an array shard by shard; each is read back and compared with the seal."""
     array = _create_array(part, spec, level)
     sizes: list[int] = []
     for shard, rows in _shards(part, spec, array):
-        values = read_rows(store, spec, rows.start, rows.stop)
-        if spec.name == FEATURES:
-            wanted = FeatureStore.open(store).array(CHECKSUMS)[rows.start : rows.stop]
-            check_row_checksums(store, spec, rows, values, wanted)
-        array[rows.start : rows.stop] = values
-        written = google_crc32c.value(values.reshape(-1).view(np.uint8))
-        del values  # a shard may be large: what is read back takes its place
+        array[rows.start : rows.stop] = read_rows(store, spec, rows.start, rows.stop)
         if shard.exists():
             sync(shard)
-        back = _read_shard(array, shard, rows)
-        if google_crc32c.value(back.reshape(-1).view(np.uint8)) != written:
-            raise _damaged(shard, f"the disk did not keep the rows of {spec.name}")
+        _read_shard(array, spec, shard, rows, seal)
         sizes.append(shard.stat().st_size if shard.exists() else 0)
         progress.update(len(rows) * spec.row_bytes)
     return ArchivedArray(
@@ -309,53 +294,51 @@ def _write_array(
 
 
 def _rebuild(manifest: Manifest, archive: Path, target: Path, part: Path) -> None:
-    specs, said = manifest.specs(archive), manifest.said(archive)
+    specs, root = manifest.specs(archive), manifest.attributes(archive)
     _write_metadata(part, {n: text for n, text in manifest.metadata.items() if n != _ZARR_JSON})
-    with closing(StoreBuild(target, specs, said.plan)) as build:
+    with closing(StoreBuild(target, specs, root.plan)) as build:
         build.allocate()
         with _progress("restore", manifest.raw_bytes) as progress:
             for name, record in manifest.arrays.items():
-                spec = build.specs[name]
-                array = _open_array(archive, spec, record)
-                shards = _shards(archive, spec, array)
-                for shard, rows in shards:
+                array = _open_array(archive, specs[name], record)
+                for shard, rows in _shards(archive, specs[name], array):
                     _check_shard(shard, array)
-                    build.write(name, rows.start, _read_shard(array, shard, rows))
-                    progress.update(len(rows) * spec.row_bytes)
+                    values = _read_shard(array, specs[name], shard, rows, root.seal)
+                    build.write(name, rows.start, values)
+                    progress.update(values.nbytes)
                 build.files(name).write_trailers()
-                _check_rebuilt(part, spec, said.seal, shards)
         build.close()
         _copy_golden(archive, part, manifest.golden)
         sync_folders(part)
         # With the root's attributes, which hold the plan, it is what an extraction would go on
         # with, or an earlier one have left, and so nothing that another restoration may remove.
-        (part / _ZARR_JSON).write_text(manifest.metadata[_ZARR_JSON], encoding="utf-8")
+        _write_metadata(part, {_ZARR_JSON: manifest.metadata[_ZARR_JSON]})
         sync(part / _ZARR_JSON)
         sync(part)
-        if what := metadata_damage(part):
-            raise _damaged(archive / _ZARR_JSON, what)
+        try:
+            check_seal(part, root.seal, specs)
+        except StoreIncomplete as error:
+            raise _damaged(archive / _ZARR_JSON, str(error)) from None
         build.put_in_place()
 
 
-def _read_shard(array: "zarr.Array[Any]", shard: Path, rows: range) -> NDArray[Any]:
-    """The rows of a shard; raises `StoreIncomplete` where it is damaged."""
+def _read_shard(
+    array: "zarr.Array[Any]", spec: ArraySpec, shard: Path, rows: range, seal: Seal | None
+) -> NDArray[Any]:
+    """The rows of a shard; raises `StoreIncomplete` where they are not those that were sealed."""
     try:
-        return np.ascontiguousarray(array[rows.start : rows.stop])
+        values = np.ascontiguousarray(array[rows.start : rows.stop])
     except (ValueError, RuntimeError) as error:
-        raise _damaged(shard, f"{array.path} cannot be read: {error}") from None
-
-
-def _check_rebuilt(
-    part: Path, spec: ArraySpec, seal: Seal | None, shards: Sequence[tuple[Path, range]]
-) -> None:
-    """Raise `StoreIncomplete` naming the shard that gave other rows than were sealed."""
-    rebuilt = trailers(part, spec)
-    for chunk in range(spec.chunk_count):
-        trailer = rebuilt[chunk * TRAILER_BYTES :][:TRAILER_BYTES]
-        if trailer != sealed_trailer(seal, spec.name, chunk):
-            rows = spec.chunk_rows_of(chunk)
-            shard = next(path for path, inside in shards if rows.start in inside)
-            raise _damaged(shard, f"rows {rows[0]} to {rows[-1]} of {spec.name} are other ones")
+        raise _damaged(shard, f"{spec.name} cannot be read: {error}") from None
+    for start in range(rows.start, rows.stop, spec.chunk_rows):
+        inside = values[start - rows.start :][: spec.chunk_rows]
+        crc = google_crc32c.value(inside.reshape(-1).view(np.uint8))
+        crc = google_crc32c.extend(crc, bytes(spec.chunk_bytes - inside.nbytes))
+        chunk = start // spec.chunk_rows
+        if crc.to_bytes(TRAILER_BYTES, "little") != sealed_trailer(seal, spec.name, chunk):
+            where = f"rows {start} to {start + len(inside) - 1} of {spec.name}"
+            raise _damaged(shard, f"{where} are other ones")
+    return values
 
 
 def _create_array(root: Path | dict[str, Any], spec: ArraySpec, level: int) -> "zarr.Array[Any]":
@@ -433,14 +416,8 @@ def _check_shard(shard: Path, array: "zarr.Array[Any]") -> None:
 
 
 def _holds(manifest: Manifest, store: Path) -> bool:
-    """Whether an archive is of this store, by metadata and seal."""
-    if _read_metadata(store) != manifest.metadata or _golden_digests(store) != manifest.golden:
-        return False
-    try:
-        check_seal(store, laid_out_attributes(store).seal, read_specs(store))
-    except StoreIncomplete:
-        return False
-    return True
+    """Whether an archive is of this store, by its metadata, which hold the seal."""
+    return _read_metadata(store) == manifest.metadata and _golden_digests(store) == manifest.golden
 
 
 def _golden_digests(store: Path) -> dict[str, str]:

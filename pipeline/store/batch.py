@@ -1,4 +1,4 @@
-"""What `gather` hands out."""
+"""The batch that `gather` fills."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
@@ -13,7 +13,7 @@ from pipeline.base.observation import Observation
 
 @dataclass
 class Batch(Observation):
-    """Everything a policy sees and should do at `batch` ticks.
+    """What a policy sees at `batch` ticks, and the actions that it should answer.
 
     A stream that the store lacks has width 0. Features and sensor have the dtype they are stored
     in.
@@ -31,18 +31,18 @@ class Batch(Observation):
         return len(self), self.action.shape[1], self.sensor.shape[1], self.state.shape[1]
 
     def to(self, device: torch.device | str, non_blocking: bool = False) -> Self:
-        """The same on another device; what a subclass has beside tensors stays as it is."""
+        """The batch on another device; fields that are no tensors stay as they are."""
         return self._each(lambda tensor: tensor.to(device, non_blocking=non_blocking))
 
     def pin(self) -> Self:
-        """The same in page-locked memory, from where copies to a GPU are asynchronous.
+        """The batch in page-locked memory, from where copies to a GPU are asynchronous.
 
-        What is not in host memory stays as it is.
+        Tensors on a device stay there.
         """
         return self._each(lambda tensor: tensor.pin_memory() if tensor.is_cpu else tensor)
 
     def touch(self) -> Self:
-        """Itself, zeroed: every page of its memory is there before it is filled at speed."""
+        """The batch itself, zeroed, so that every page of its memory exists before it is filled."""
         return self._each(lambda tensor: tensor.zero_())
 
     def _each(self, change: Callable[[Tensor], Tensor]) -> Self:

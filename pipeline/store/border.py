@@ -1,6 +1,6 @@
-"""What a store, an array of it and an episode in it say of themselves, read once.
+"""The documents of a store, of its arrays and of its episodes, as models.
 
-A store may come from anywhere: nothing behind this module asks a dictionary what it holds.
+A store may come from anywhere: code behind this module asks no dictionary what it holds.
 """
 
 from functools import lru_cache
@@ -19,7 +19,7 @@ Length = Annotated[int, Field(ge=0, le=2**48)]
 
 @lru_cache(64)
 def store_border(root: Path) -> Border:
-    """How what a store or a build says of itself is refused."""
+    """Refuses broken documents of a store or a build."""
     return Border(StoreIncomplete, mend(root))
 
 
@@ -32,7 +32,7 @@ class Group(Document):
 
 
 class ArrayDocument(Document):
-    """The `zarr.json` of an array: what decides the rest of it."""
+    """The entries of an array's `zarr.json` that decide all others."""
 
     shape: list[Length]
     data_type: Text
@@ -45,13 +45,13 @@ _Pixels = Annotated[int, Field(ge=1, le=2**13)]
 
 
 class FrameDocument(Document):
-    """The `zarr.json` of a golden frame: one chunk, as long as it is."""
+    """The `zarr.json` of a golden frame, which is one chunk."""
 
     shape: tuple[_Pixels, _Pixels, Literal[3]]
 
 
 class EpisodeText(Document):
-    """What `episode/text` says of an episode."""
+    """The text of an episode in `episode/text`."""
 
     id: Text
     path: Text
@@ -67,7 +67,7 @@ class _Environment(Document):
 
 
 class StoredGolden(Document):
-    """What a store says of a golden row."""
+    """A golden row in the root attributes."""
 
     row: Length
     prompt: Annotated[str, Field(max_length=10**6)]
@@ -75,10 +75,12 @@ class StoredGolden(Document):
 
 
 class StoreAttributes(SourceDocument):
-    """The root attributes of a store or a laid-out build."""
+    """The root attributes of a store or a laid-out build; `raw` has all of them, unchanged.
+
+    `seal` has the trailers of each array's chunk files in order, in hex; a build has none yet.
+    """
 
     raw: dict[str, Any]
-    """All of them, as they stand there."""
     version: Literal[1] = Field(alias="schema")
     plan: Text
     slots: list[SlotDocument]
@@ -86,12 +88,11 @@ class StoreAttributes(SourceDocument):
     environment: list[_Environment]
     golden: list[StoredGolden] = Field(default_factory=list, max_length=16)
     seal: dict[Text, Annotated[str, Field(pattern="^([0-9a-f]{8})*$")]] | None = None
-    """By array, the trailers of its chunk files in order, in hex; None in a build."""
 
     @classmethod
     def of(
         cls, root: Path, attributes: dict[str, Any], border: Border | None = None
     ) -> "StoreAttributes":
-        """Those of the store at `root`. Raises `StoreIncomplete` naming the entry that is wrong."""
+        """Parse those of the store at `root`; raises `StoreIncomplete` naming a wrong entry."""
         entries = {**attributes, "raw": attributes}
         return (border or store_border(root)).parse(entries, cls, root / "zarr.json")

@@ -1,8 +1,8 @@
 """Golden rows in a store: the group `golden`, beside the arrays that training maps.
 
 `golden/<n>/<view>` are decoded frames, compressed, as plain zarr reads them; the root's attribute
-`golden` says of each n its row, rendered prompt and views. They prove themselves: frames and prompt
-give the key of their row. A store of an earlier version has none.
+`golden` has the row, the rendered prompt and the views of each n. They prove themselves: frames and
+prompt give the key of their row. A store of an earlier version has none.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -35,20 +35,19 @@ _ZSTD_LEVEL = 5
 
 @dataclass(frozen=True, eq=False)
 class GoldenFrames:
-    """The decoded frames and the rendered prompt of a VL row."""
+    """The rendered prompt of a VL row and its decoded frames (height, width, 3) RGB by view."""
 
     row: int
     prompt: str
     frames: Mapping[str, NDArray[np.uint8]]
-    """By view: (height, width, 3) RGB."""
 
     def key(self, spec: Mapping[str, Any]) -> bytes:
-        """The row's key, where they are what its features were computed from."""
+        """The key that these frames and this prompt give under a feature spec."""
         return row_key(spec["digest"], spec.get("views", ()), self.prompt, self.frames)
 
 
 def write_golden(root: Path, rows: Sequence[GoldenFrames]) -> None:
-    """Put these golden rows into a build, in place of what was there. Raises `DiskFull`."""
+    """Write these golden rows into a build, in place of earlier ones. Raises `DiskFull`."""
     with disk_full_named(root):
         zarr.create_group(root, path=GOLDEN, overwrite=True)
         for number, golden in enumerate(rows):
@@ -66,23 +65,24 @@ def read_golden(root: Path, keys: NDArray[np.uint8]) -> list[GoldenFrames]:
 
     Raises `StoreIncomplete` naming the one that cannot be read or does not give its key.
     """
-    said = laid_out_attributes(root)
-    entries = enumerate(said.golden)
-    return [_read(root, said, number, keys[entry.row]) for number, entry in entries]
+    attributes = laid_out_attributes(root)
+    entries = enumerate(attributes.golden)
+    return [_read(root, attributes, number, keys[entry.row]) for number, entry in entries]
 
 
 def carried_golden(
     root: Path, spec: Mapping[str, Any], keys: NDArray[np.uint8]
 ) -> Iterator[GoldenFrames]:
-    """The golden rows of a store that are rows of a build, whose spec and `keys` (row, 16) these
-    are; as the first row of that key. What is damaged is left out: the rest prove themselves.
+    """The golden rows of a store that a build of this spec and these `keys` (row, 16) has, too.
+
+    Each gets the number of the first row of its key in the build. Damaged ones are left out.
     """
     try:
         check_metadata(root)
-        said = laid_out_attributes(root)
+        attributes = laid_out_attributes(root)
     except StoreIncomplete:
         return
-    for number, entry in enumerate(said.golden):
+    for number, entry in enumerate(attributes.golden):
         with suppress(StoreIncomplete):
             golden = _unproven(root, number, entry)
             same = keys == np.frombuffer(golden.key(spec), np.uint8)
@@ -90,26 +90,28 @@ def carried_golden(
                 yield replace(golden, row=row)
 
 
-def golden_issues(root: Path, said: StoreAttributes, keys: ArraySpec | None) -> Iterator[Issue]:
-    """What is wrong with the golden rows; nothing where the keys themselves cannot be read."""
+def golden_issues(
+    root: Path, attributes: StoreAttributes, keys: ArraySpec | None
+) -> Iterator[Issue]:
+    """The damage of golden rows; none is found where the keys cannot be read."""
     if keys is None:
         return
-    for number, entry in enumerate(said.golden):
+    for number, entry in enumerate(attributes.golden):
         try:
             key = read_rows(root, keys, entry.row, entry.row + 1)[0]
         except StoreIncomplete:
             continue
         try:
-            _read(root, said, number, key)
+            _read(root, attributes, number, key)
         except StoreIncomplete as error:
             yield Issue(severity="error", kind="golden row", message=str(error), stream=GOLDEN)
 
 
-def golden_files(root: Path, said: StoreAttributes) -> set[Path]:
-    """The files of the golden rows that a store says it has."""
-    groups = [root / GOLDEN] * ("golden" in said.model_fields_set)
+def golden_files(root: Path, attributes: StoreAttributes) -> set[Path]:
+    """The files of the golden rows that the root attributes list."""
+    groups = [root / GOLDEN] * ("golden" in attributes.model_fields_set)
     frames: list[Path] = []
-    for number, entry in enumerate(said.golden):
+    for number, entry in enumerate(attributes.golden):
         groups.append(root / GOLDEN / str(number))
         frames += [groups[-1] / view for view in entry.views]
     chunks = {frame / "c" / "0" / "0" / "0" for frame in frames}
@@ -128,15 +130,17 @@ def _write_frame(root: Path, name: str, frame: NDArray[np.uint8]) -> None:
         compressors=[ZstdCodec(level=_ZSTD_LEVEL), Crc32cCodec()],
         fill_value=0,
         dimension_names=("height", "width", "rgb"),
-        config={"write_empty_chunks": True},  # a black frame has a file too
+        config={"write_empty_chunks": True},  # a black frame has a file, too
     )
     array[:] = frame
 
 
-def _read(root: Path, said: StoreAttributes, number: int, key: NDArray[np.uint8]) -> GoldenFrames:
+def _read(
+    root: Path, attributes: StoreAttributes, number: int, key: NDArray[np.uint8]
+) -> GoldenFrames:
     """One golden row; `StoreIncomplete` where it cannot be read or does not give the key."""
-    golden = _unproven(root, number, said.golden[number])
-    if golden.key(said.raw["feature_spec"]) != key.tobytes():
+    golden = _unproven(root, number, attributes.golden[number])
+    if golden.key(attributes.raw["feature_spec"]) != key.tobytes():
         why = f"golden frames and prompt of VL row {golden.row} do not give the key of that row"
         raise store_border(root).refusal(root / GOLDEN / str(number), why)
     return golden
@@ -150,10 +154,10 @@ def _unproven(root: Path, number: int, entry: StoredGolden) -> GoldenFrames:
 
 
 def _read_frame(root: Path, place: Path) -> NDArray[np.uint8]:
-    """A frame (height, width, 3) as `_write_frame` wrote it; it unpacks to no more than that."""
+    """A frame (height, width, 3) that `_write_frame` wrote; never unpacks more than its shape."""
     border = store_border(root)
-    said = border.read_json(place / "zarr.json", FrameDocument)
-    frame = np.zeros(said.shape, np.uint8)
+    document = border.read_json(place / "zarr.json", FrameDocument)
+    frame = np.zeros(document.shape, np.uint8)
     chunk = place / "c" / "0" / "0" / "0"
     packed = border.read_bytes(chunk, frame.nbytes + 2**16)
     trailer = int.from_bytes(packed[-TRAILER_BYTES:], "little")

@@ -9,13 +9,15 @@ of a merged store is completed by merging the same stores again.
 
 import hashlib
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from tqdm import tqdm
 
 from pipeline.base.commands import command
@@ -58,38 +60,47 @@ _COPIED = [
     name for name in ARRAY_NAMES if name.split("/")[0] in STREAMS and name not in INCREMENTAL
 ]
 _BLOCK_BYTES = 32 * 2**20
+
+# Attributes of an input's root that would be false of the merged store.
 _NOT_TAKEN = (METADATA_DIGEST, SEAL, GOLDEN)
-"""Attributes of an input's root that would be false of the merged store."""
 
 
-@dataclass
+@dataclass(frozen=True)
 class EpisodeRun:
-    """Episodes that stand one behind the other in an input and so in the merged store."""
+    """Episodes that stand one behind the other in an input and so in the merged store.
+
+    By stream: their `rows` in the input, and by how much the numbers of these rows grow.
+    """
 
     store: FeatureStore
-    first: Episode
-    last: Episode
-    index: int
-    """Of the first episode in the merged store."""
+    rows: Mapping[str, range]
+    shift: Mapping[str, int]
 
-    def rows(self, stream: str) -> range:
-        """Their rows in the input."""
-        name = STREAMS[stream].rows
-        return range(getattr(self.first, name).start, getattr(self.last, name).stop)
+    def blocks(self, name: str, rows: range | None = None) -> Iterator[tuple[range, NDArray[Any]]]:
+        """Rows of an array of the input, or some of them, and what they hold, block by block.
+
+        Read with plain system calls: a file that was cut off is an error, not a SIGBUS.
+        """
+        spec = read_spec(self.store.path, name)
+        rows = self.rows[name.split("/")[0]] if rows is None else rows
+        step = max(1, _BLOCK_BYTES // max(1, spec.row_bytes))
+        for block in (rows[at : at + step] for at in range(0, len(rows), step)):
+            yield block, read_rows(self.store.path, spec, block.start, block.stop)
 
 
 class MergedEpisodes:
     """The episodes of several stores one behind the other, those of equal digest once.
 
     Different episodes of one name, as of two places that both call a source `lab`, are named apart
-    by their store, and printed.
+    by their store, and printed. `arrays` are those under `episode/`; `twice` counts the episodes
+    that an earlier input has, too.
     """
 
     def __init__(self, stores: Sequence[FeatureStore]) -> None:
         self.stores = stores
         self.sources = list(dict.fromkeys(name for store in stores for name in store.sources))
-        self.runs: list[EpisodeRun] = []
         self.episodes: list[Episode] = []
+        taken: list[tuple[FeatureStore, Episode]] = []
         digests: set[str] = set()
         names: dict[tuple[str, str], Path] = {}
         for store, episode in [(held, episode) for held in stores for episode in held.episodes]:
@@ -103,16 +114,27 @@ class MergedEpisodes:
                     f"of {names[episode.source, episode.id]}, and named {episode.source}/{name}"
                 )
             names[episode.source, name] = store.path
-            run = self.runs[-1] if self.runs else None
-            if run and run.store is store and run.last.index + 1 == episode.index:
-                run.last = episode
-            else:
-                self.runs.append(EpisodeRun(store, episode, episode, len(self.episodes)))
+            taken.append((store, episode))
             self.episodes.append(replace(episode, id=name))
         self.twice = sum(len(store.episodes) for store in stores) - len(self.episodes)
-        """Episodes that an earlier input holds just so."""
         self.arrays = index_arrays(self.episodes, self.sources)
-        """Those under `episode/`."""
+        self.runs = [*self._runs(taken)]
+
+    def _runs(self, taken: Sequence[tuple[FeatureStore, Episode]]) -> Iterator[EpisodeRun]:
+        """The episodes in runs that are as long as can be."""
+        numbered = ((store, episode, at) for at, (store, episode) in enumerate(taken))
+        for _, alike in groupby(numbered, lambda it: (it[0].path, it[1].index - it[2])):
+            run = list(alike)
+            (store, first, begin), (_, last, _) = run[0], run[-1]
+            rows = {
+                name: range(getattr(first, stream.rows).start, getattr(last, stream.rows).stop)
+                for name, stream in STREAMS.items()
+            }
+            shift = {
+                name: int(self.arrays[f"episode/{name}_start"][begin]) - inside.start
+                for name, inside in rows.items()
+            }
+            yield EpisodeRun(store, rows, shift)
 
     @property
     def plan(self) -> str:
@@ -144,10 +166,6 @@ class MergedEpisodes:
     def count(self, stream: str) -> int:
         """Rows of a stream."""
         return int(self.arrays[f"episode/{stream}_start"][-1])
-
-    def shift(self, run: EpisodeRun, stream: str) -> int:
-        """By how much the numbers of a run's rows grow."""
-        return int(self.arrays[f"episode/{stream}_start"][run.index]) - run.rows(stream).start
 
 
 def merge(inputs: Sequence[Path], output: Path | None) -> MergedEpisodes | None:
@@ -271,14 +289,17 @@ def _lay_out(build: StoreBuild, merged: MergedEpisodes, inodes: Sequence[Inode |
     first = merged.stores[0]
     build.create()
     for name in _COPIED:
-        rows = merged.runs[0].rows(name.split("/")[0])
+        rows = merged.runs[0].rows[name.split("/")[0]]
         build.link_unchanged(name, first.path, read_spec(first.path, name), rows.stop)
     build.allocate()
     for name, values in merged.arrays.items():
         build.write(name, 0, values)
     for name in tqdm(_COPIED, "streams", unit="array", disable=None, leave=False):
         for run in merged.runs:
-            _copy_rows(build, name, merged, run)
+            for rows, values in run.blocks(name):  # those in linked chunks are there
+                if name in POSITIONS:
+                    values += run.shift[POSITIONS[name]]
+                build.write(name, rows.start + run.shift[name.split("/")[0]], values)
     for store, inode in zip(merged.stores, inodes, strict=True):
         refuse_replaced(store.path, inode)
     streams = {name: merged.having(name).streams[name] for name in ("sensor", "state")}
@@ -289,57 +310,39 @@ def _lay_out(build: StoreBuild, merged: MergedEpisodes, inodes: Sequence[Inode |
     build.finish_layout(attrs | its_own | store_attributes(tuned), of_vl)
 
 
-def _copy_rows(build: StoreBuild, name: str, merged: MergedEpisodes, run: EpisodeRun) -> None:
-    """Write rows of an input in blocks; those in linked chunks are there.
-
-    Read with plain system calls: a file that was cut off is an error, not a SIGBUS.
-    """
-    stream = name.split("/")[0]
-    source, rows = read_spec(run.store.path, name), run.rows(stream)
-    shift = merged.shift(run, stream)
-    step = max(1, _BLOCK_BYTES // max(1, source.row_bytes))
-    for start in range(rows.start, rows.stop, step):
-        values = read_rows(run.store.path, source, start, min(start + step, rows.stop))
-        if name in POSITIONS:
-            values += merged.shift(run, POSITIONS[name])
-        build.write(name, start + shift, values)
-
-
 def _fill(build: StoreBuild, merged: MergedEpisodes) -> None:
     """Copy the feature rows that are missing, with their keys and environments.
 
-    In blocks of one environment. Raises `StoreIncomplete` naming a row that
-    does not give its checksum.
+    Raises `StoreIncomplete` naming a row that does not give its checksum.
     """
-    missing, spec = build.missing(), build.specs[FEATURES]
-    total, step = spec.shape[0], max(1, _BLOCK_BYTES // max(1, spec.row_bytes))
+    missing, total = build.missing(), build.specs[FEATURES].shape[0]
     done = total - len(missing)
     with tqdm(total=total, initial=done, desc="merge", unit="row", disable=None) as progress:
         for run in merged.runs:
-            store, rows, shift = run.store, run.rows("vl"), merged.shift(run, "vl")
+            store, rows, shift = run.store, run.rows["vl"], run.shift["vl"]
             source = read_spec(store.path, FEATURES)
             first, last = np.searchsorted(missing, [rows.start + shift, rows.stop + shift])
             wanted = missing[first:last] - shift
             for environment, part in environment_runs(store.attrs["environment"], wanted):
                 number = build.environment_index(environment)
-                for block in (part[at : at + step] for at in range(0, len(part), step)):
-                    start, stop = block.start, block.stop
-                    values = read_rows(store.path, source, start, stop)
-                    checksums = store.array(CHECKSUMS)[start:stop]
+                for block, values in run.blocks(FEATURES, part):
+                    inside = slice(block.start, block.stop)
+                    checksums = store.array(CHECKSUMS)[inside]
                     check_row_checksums(store.path, source, block, values, checksums)
-                    keys = [key.tobytes() for key in store.array(KEYS)[start:stop]]
-                    build.commit(range(start + shift, stop + shift), values, keys, number)
+                    keys = [key.tobytes() for key in store.array(KEYS)[inside]]
+                    there = range(block.start + shift, block.stop + shift)
+                    build.commit(there, values, keys, number)
                     progress.update(len(block))
 
 
 def _golden(merged: MergedEpisodes) -> list[GoldenFrames]:
     """Golden rows of the merged store, chosen among those of the inputs and proven once more."""
     inputs = {store.path: read_golden(store.path, store.array(KEYS)) for store in merged.stores}
-    given = [
-        replace(golden, row=golden.row + merged.shift(run, "vl"))
+    known = [
+        replace(golden, row=golden.row + run.shift["vl"])
         for run in merged.runs
         for golden in inputs[run.store.path]
-        if golden.row in run.rows("vl")
+        if golden.row in run.rows["vl"]
     ]
-    views = np.array([len(golden.frames) for golden in given], np.int64)
-    return [given[place] for place in spread(np.arange(len(given)), views)]
+    views = np.array([len(golden.frames) for golden in known], np.int64)
+    return [known[place] for place in spread(np.arange(len(known)), views)]

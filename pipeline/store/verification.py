@@ -1,8 +1,7 @@
 """Check a whole store: metadata, files, the checksum of every row, NaN.
 
 Every byte is read once, a chunk file at a time in blocks of a few megabytes, by several threads or
-by dask workers on hosts that see the store. What the arrays say of each other is left to those who
-build stores: the trailers prove that they hold what was written.
+by dask workers on hosts that see the store.
 """
 
 import os
@@ -58,46 +57,48 @@ from pipeline.store.schema import (
     rows_of,
 )
 
+# How a feature row is.
 SOUND, UNREADABLE, CHANGED, NOT_FINITE = range(4)
 FAULTS = ("", "not in its file", "its bytes do not give its checksum", "NaN or infinity")
-"""How a feature row is, in words."""
+
 _Error = partial(Issue, severity="error")
 
 
 @dataclass(frozen=True)
 class ChunkReport:
-    """How one chunk file is."""
+    """The state of one chunk file.
+
+    `rows` are those of the array, without padding; `bytes` those that were read; `damage` is wrong
+    with the file as a file. `faults` has an index into `FAULTS` for each feature row, and is empty
+    for another array.
+    """
 
     array: str
     path: Path
     rows: range
-    """Of the array, those of padding left out."""
     bytes: int
-    """That were read."""
     damage: str | None
-    """What is wrong with the file as a file."""
     faults: NDArray[np.uint8]
-    """How each feature row is, an index into `FAULTS`; empty for another array."""
 
 
 @dataclass(frozen=True)
 class Verification:
-    """What was checked of a store and everything that is wrong with it."""
+    """What was checked of a store and everything that is wrong with it.
+
+    `inode` is that of the store that was checked: another may have taken its place since. `rows`
+    feature rows could be read; `bytes` of chunk files, padding included. `bad_rows` are the VL rows
+    whose features cannot be used, ascending. `environments` has the software and hardware of
+    ranges of rows, where the store has them.
+    """
 
     store: Path
     inode: Inode | None
-    """Of the store that was checked: another may have taken its place since."""
     rows: int
-    """Feature rows that could be read and were checked."""
     bytes: int
-    """Of the chunk files that were read, with the padding behind the last rows."""
     seconds: float
     issues: tuple[Issue, ...]
-    """Of metadata, chunk files and feature rows, `stream` being the array, and strange files."""
     bad_rows: NDArray[np.int64]
-    """The VL rows whose features cannot be used, ascending."""
     environments: Sequence[Mapping[str, Any]]
-    """With which software and hardware which rows were computed, where the store says it."""
 
     @property
     def sound(self) -> bool:
@@ -106,11 +107,11 @@ class Verification:
 
     @property
     def damaged(self) -> list[Issue]:
-        """Those of metadata and chunk files."""
+        """The issues of metadata and chunk files."""
         return [issue for issue in self.issues if issue.kind in ("metadata", "chunk")]
 
     def damaged_chunks(self, array: str) -> set[int]:
-        """Chunks of an array that something is wrong with."""
+        """The damaged chunks of an array."""
         issues = (issue for issue in self.damaged if issue.stream == array)
         return {issue.chunk for issue in issues if issue.chunk is not None}
 
@@ -142,18 +143,47 @@ def verify(path: Path, threads: int, workers: int | str = 0) -> Verification:
     attributes = find_attributes(path)
     read_plan(path)  # without one, nothing of it can be kept
     specs, issues = read_arrays(path)
-    said = None
+    parsed = None
     try:
-        said = StoreAttributes.of(path, attributes)
+        parsed = StoreAttributes.of(path, attributes)
         if not issues and (what := metadata_damage(path)):
             issues.append(_metadata_issue(path, what))
-        if said.seal is None:
+        if parsed.seal is None:
             issues.append(_metadata_issue(path, UNSEALED))
         if not issues:
-            check_agreement(path, said, specs)
+            check_agreement(path, parsed, specs)
     except StoreIncomplete as error:
         issues.append(_metadata_issue(path, str(error)))
-    seal = said.seal if said else None
+    reports = _check_chunks(path, specs, parsed.seal if parsed else None, threads, workers)
+    store = None
+    if not issues:
+        try:
+            store = _index(path, attributes, specs, reports)
+        except StoreIncomplete as error:
+            issues.append(_metadata_issue(path, str(error)))
+    issues += [issue for report in reports for issue in _issues(report, specs[report.array], store)]
+    if parsed is not None:
+        issues += golden_issues(path, parsed, specs.get(KEYS))
+    issues += strange_files(path, specs, golden_files(path, parsed) if parsed else None)
+    issues += [*_strange_to_zarr(path, issues)]
+    refuse_replaced(path, inode)
+    bad_rows = [report.rows.start + np.flatnonzero(report.faults) for report in reports]
+    return Verification(
+        store=path,
+        inode=inode,
+        rows=sum(int((report.faults != UNREADABLE).sum()) for report in reports),
+        bytes=sum(report.bytes for report in reports),
+        seconds=time.monotonic() - begun,
+        issues=tuple(issues),
+        bad_rows=np.concatenate([np.zeros(0, np.int64), *bad_rows]),
+        environments=parsed.raw.get("environment", []) if parsed else [],
+    )
+
+
+def _check_chunks(
+    path: Path, specs: Mapping[str, ArraySpec], seal: Seal | None, threads: int, workers: int | str
+) -> list[ChunkReport]:
+    """A report of every chunk file, in the order of the contract."""
     checks = [
         partial(check_chunk, path, specs, name, chunk, seal)
         for name, spec in specs.items()
@@ -173,38 +203,27 @@ def verify(path: Path, threads: int, workers: int | str = 0) -> Verification:
             f"{path}: expected the workers to see the store under this path, they find no file. "
             "Put it on a file system that they share, or set verify.workers=0."
         )
-    reports.sort(key=lambda report: (ARRAY_NAMES.index(report.array), report.rows.start))
-    # Rows are named by episode and time, where that part of the store is sound.
-    names = [name for name in specs if name.startswith("episode/") or name.endswith("/time")]
-    names += POSITIONS
-    store = None
-    if not issues and not any(report.damage for report in reports if report.array in names):
-        maps = {name: map_array(path, specs[name]) for name in names}
-        try:
-            check_index(path, maps, rows_of(specs))
-            check_positions(path, maps)
-            store = FeatureStore(path, attributes, maps)
-            _ = store.episodes
-        except StoreIncomplete as error:
-            store = None
-            issues.append(_metadata_issue(path, str(error)))
-    issues += [issue for report in reports for issue in _issues(report, specs[report.array], store)]
-    if said is not None:
-        issues += golden_issues(path, said, specs.get(KEYS))
-    issues += strange_files(path, specs, golden_files(path, said) if said else None)
-    issues += [*_strange_to_zarr(path, issues)]
-    refuse_replaced(path, inode)
-    bad_rows = [report.rows.start + np.flatnonzero(report.faults) for report in reports]
-    return Verification(
-        store=path,
-        inode=inode,
-        rows=sum(int((report.faults != UNREADABLE).sum()) for report in reports),
-        bytes=sum(report.bytes for report in reports),
-        seconds=time.monotonic() - begun,
-        issues=tuple(issues),
-        bad_rows=np.concatenate([np.zeros(0, np.int64), *bad_rows]),
-        environments=said.raw.get("environment", []) if said else [],
-    )
+    return sorted(reports, key=lambda report: (ARRAY_NAMES.index(report.array), report.rows.start))
+
+
+def _index(
+    path: Path,
+    attributes: Mapping[str, Any],
+    specs: Mapping[str, ArraySpec],
+    reports: Sequence[ChunkReport],
+) -> FeatureStore | None:
+    """A store of episodes, clocks and positions alone, by which rows are named; None where these
+    are damaged. Raises `StoreIncomplete` where they do not fit each other."""
+    names = {name for name in specs if name.startswith("episode/") or name.endswith("/time")}
+    names |= POSITIONS.keys()
+    if any(report.damage for report in reports if report.array in names):
+        return None
+    maps = {name: map_array(path, specs[name]) for name in names}
+    check_index(path, maps, rows_of(specs))
+    check_positions(path, maps)
+    store = FeatureStore(path, attributes, maps)
+    _ = store.episodes
+    return store
 
 
 def read_arrays(root: Path) -> tuple[dict[str, ArraySpec], list[Issue]]:
@@ -247,10 +266,10 @@ def check_chunk(
 def _judge_rows(
     root: Path, specs: Mapping[str, ArraySpec], start: int, features: NDArray[Any]
 ) -> NDArray[np.int64]:
-    """How each feature row (row, slot, dim) from `start` is, (row,) indices into `FAULTS`.
+    """The faults (row,) of feature rows (row, slot, dim) from `start`, indices into `FAULTS`.
 
-    A NaN in a slot that is not valid is nobody's. Where checksums or validity cannot be read, as is
-    said of their files, no checksum is right and every slot is valid.
+    A NaN in an invalid slot is no fault. Where checksums cannot be read, none is right; where the
+    validity cannot be read, every slot is valid.
     """
     stop = start + len(features)
     try:
@@ -269,8 +288,8 @@ def _judge_rows(
 def strange_files(
     root: Path, specs: Mapping[str, ArraySpec], golden: Collection[Path] | None
 ) -> Iterator[Issue]:
-    """Files that have no place in a store; `golden` are those of its golden rows, None where it
-    does not say which these are."""
+    """Files that have no place in a store; `golden` are those of its golden rows, None where they
+    are not known."""
     expected = {*(golden or ())} | {
         root / place / "zarr.json" for place in ("", *GROUPS, *ARRAY_NAMES)
     }
@@ -285,7 +304,7 @@ def strange_files(
 
 
 def _strange_to_zarr(root: Path, issues: Sequence[Issue]) -> Iterator[Issue]:
-    """Documents that zarr itself cannot open, where nothing else is said of them.
+    """Documents that zarr itself cannot open, and that no issue names yet.
 
     Each alone in a group: beside it may lie one that is a pipe, for whose end zarr would wait.
     """
@@ -306,8 +325,8 @@ def _strange_to_zarr(root: Path, issues: Sequence[Issue]) -> Iterator[Issue]:
 
 def _metadata_issue(root: Path, what: str, array: str = "") -> Issue:
     file = root / array / "zarr.json"
-    said = what.removeprefix(f"{file}: ")
-    return _Error(kind="metadata", message=said, stream=array, file=file)
+    message = what.removeprefix(f"{file}: ")
+    return _Error(kind="metadata", message=message, stream=array, file=file)
 
 
 def _run(checks: Sequence[Callable[[], ChunkReport]], threads: int) -> Generator[ChunkReport]:
@@ -351,7 +370,7 @@ def _issues(report: ChunkReport, spec: ArraySpec, store: FeatureStore | None) ->
 
 
 def _name(store: FeatureStore | None, stream: str, rows: range) -> str:
-    """Which rows of which episodes these are."""
+    """The episodes of the first and last of these rows."""
     if store is None or stream not in STREAMS:
         return ""
     ends = dict.fromkeys((rows[0], rows[-1]))

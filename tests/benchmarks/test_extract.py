@@ -13,7 +13,7 @@ from benchmarks.cases import Case
 from benchmarks.extract import _deviation, measure
 from benchmarks.profiling import Stopwatch
 from benchmarks.stage_one import StageOne
-from pipeline.extract.engine import RowPreparation
+from pipeline.extract.rows import RowPreparation
 from pipeline.vlm import collation
 
 OPTIONS = Namespace(batch_size=2, rounds=1, profile=True, compile=False)

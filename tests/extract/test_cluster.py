@@ -35,14 +35,7 @@ from pipeline.base.errors import (
     VLMError,
 )
 from pipeline.extract import extract
-from pipeline.extract.cluster import (
-    ExtractionJob,
-    check_place,
-    check_scheduler,
-    connected,
-    device_of,
-)
-from pipeline.extract.plan import rate_name
+from pipeline.extract.cluster import ExtractionPlugin, check_scheduler, connected
 from pipeline.extract.survey import Survey, survey
 from pipeline.store import FeatureStore, RowSource, StoreBuild, part_path, read_plan
 from pipeline.store.schema import ARRAY_NAMES, read_specs
@@ -58,7 +51,7 @@ from contextlib import suppress
 from pathlib import Path
 from pipeline.base.errors import NumericsError
 from pipeline.extract.encoder import Encoder
-from pipeline.extract.engine import RowPreparation
+from pipeline.extract.rows import RowPreparation
 from pipeline.extract.cluster import ExtractionPlugin
 
 control = Path({control!r})
@@ -396,22 +389,18 @@ class TestRefusals:
         surveyed = Survey(
             params.model_copy(update={"extract": elsewhere}), (), (), (), spec, "rotvec", "plan"
         )
-        job = ExtractionJob(surveyed, (), Path.cwd())
+        plugin = ExtractionPlugin(surveyed, ())
         with pytest.raises(ConfigError, match=r"with the build .*made\.zarr\.part"):
-            check_place(job)
+            plugin.check_place()
         monkeypatch.setattr("pipeline.extract.cluster.read_plan", lambda part: "plan")
-        check_place(job)
-        other = replace(
-            job,
-            surveyed=replace(
-                surveyed, params=changed(vlm={"layers": [0]}, extract=elsewhere.model_dump())
-            ),
-        )
+        plugin.check_place()
+        other_params = changed(vlm={"layers": [0]}, extract=elsewhere.model_dump())
+        other = ExtractionPlugin(replace(surveyed, params=other_params), ())
         with pytest.raises(ConfigError, match="would compute other features"):
-            check_place(other)
+            other.check_place()
         monkeypatch.chdir(tmp_path)
         with pytest.raises(ConfigError, match=f"runs in {tmp_path}"):
-            check_place(job)
+            plugin.check_place()
 
     @pytest.mark.parametrize(
         ("wanted", "local", "name", "device"),
@@ -429,7 +418,7 @@ class TestRefusals:
         monkeypatch.setattr("torch.cuda.device_count", lambda: 2)
         params = changed(extract={"device": wanted, "workers": 4 if local else "tcp://a:1"})
         surveyed = Survey(params, (), (), (), None, "rotvec", "")  # type: ignore[arg-type]
-        assert device_of(ExtractionJob(surveyed, (), Path()), name) == device
+        assert ExtractionPlugin(surveyed, ()).device_of(name) == device
 
     def test_errors_survive_the_way_from_a_worker(self):
         children = [
@@ -514,7 +503,7 @@ class TestLocalProcesses:
         assert report.computed == len(missing)
         assert_same(store, here)
         surveyed = survey(with_workers, ContentDigests(ledger_path(store)))
-        rate = ContentDigests(ledger_path(store)).rate(rate_name(surveyed))
+        rate = ContentDigests(ledger_path(store)).rate(surveyed.rate_name)
         assert rate is not None
         assert 0 < rate < math.inf
 

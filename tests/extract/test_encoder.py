@@ -10,7 +10,7 @@ import torch
 
 from pipeline.base.errors import NumericsError, VLMError
 from pipeline.extract.encoder import Encoder
-from pipeline.extract.engine import ReadyRow
+from pipeline.extract.rows import ReadyRow
 from pipeline.vlm.preparation import PreparedRow, TokenLayout
 
 K = 3

@@ -5,7 +5,7 @@ import os
 import shutil
 import subprocess
 import sys
-from contextlib import suppress
+from contextlib import closing, suppress
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +13,7 @@ import pytest
 import torch
 from PIL import Image
 
+from pipeline.base.digests import ContentDigests, ledger_path
 from pipeline.base.errors import (
     ConfigError,
     DiskFull,
@@ -27,6 +28,7 @@ from pipeline.data.lerobot_rows import stored_clock
 from pipeline.data.timeline import build_timeline
 from pipeline.data.windowed import WindowedRecording
 from pipeline.extract import extract
+from pipeline.extract.survey import survey
 from pipeline.simulation.insertion_formats import write_lerobot
 from pipeline.simulation.recorder import simulate_episode
 from pipeline.store import FeatureStore, StoreBuild, build_lock, part_path
@@ -296,6 +298,26 @@ class TestWhatItTakesOver:
         assert told.pop(path.parent.name) == "monday"
         assert told
         assert not any(told.values())
+
+    def test_a_link_to_other_files_of_equal_size_and_time_is_noticed(
+        self, params, recordings, tmp_path
+    ):
+        episode, contents = recordings / "Touch_dot" / "episode_1", []
+        places = [tmp_path / "first", tmp_path / "second"]
+        shutil.copytree(episode, places[1])
+        episode.rename(places[0])
+        for place in places:
+            path = place / "robot_states.npz"
+            if contents:
+                data = bytearray(path.read_bytes())
+                data[200] ^= 1
+                path.write_bytes(data)
+                os.utime(path, ns=(0, (places[0] / path.name).stat().st_mtime_ns))
+            episode.unlink(missing_ok=True)
+            episode.symlink_to(place)  # equal names, sizes and times, other bytes
+            with closing(ContentDigests(ledger_path(params.extract.store))) as digests:
+                contents.append(survey(params, digests).contents)
+        assert len(contents[0] - contents[1]) == 1
 
     def test_a_changed_file_is_noticed(self, params, recordings):
         run(params)  # notes what the files hold

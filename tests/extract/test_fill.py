@@ -7,7 +7,8 @@ import pytest
 
 from pipeline.base.errors import DiskFull
 from pipeline.extract import extract
-from pipeline.extract.engine import RowPreparation, in_background
+from pipeline.extract.engine import in_background
+from pipeline.extract.rows import RowPreparation
 from pipeline.store import FeatureStore, StoreBuild
 from pipeline.vlm.qwen import FrozenVLM
 

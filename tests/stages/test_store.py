@@ -135,7 +135,7 @@ def test_gc_lists_and_removes_only_when_told_to(
     said = capsys.readouterr().out
     assert f"unneeded: {stores}/new.zarr.part" in said
     assert f"unneeded: {stores}/one.zarr.lock, 0 B: held by no process" in said
-    assert f"kept: {stores}/two.zarr.part: unfinished build, 60 of 60 rows done" in said
+    assert f"kept: {stores}/two.zarr.part: unfinished build with 60 feature rows" in said
     assert "--remove removes them" in said
     assert len(os.listdir(stores)) == 5
     assert command(params, "gc", "--remove") == 0

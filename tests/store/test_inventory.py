@@ -14,17 +14,16 @@ from pipeline.base.durable import HELD, KEPT, previous_path
 from pipeline.base.errors import ConfigError, StoreLocked
 from pipeline.base.ownership import MARKER, begin_folder, mark
 from pipeline.store import FeatureStore, StoreBuild, build_lock
-from pipeline.store.admin import (
-    Inventory,
-    StoreEntry,
-    describe_inventory,
-    describe_kept,
-    find_leftovers,
-    find_named,
-    remove_leftover,
-    take_inventory,
-)
 from pipeline.store.archive import archive
+from pipeline.store.inventory import (
+    StoreEntry,
+    describe_kept,
+    describe_stores,
+    fate_of,
+    find_named,
+    list_stores,
+    remove_entry,
+)
 from pipeline.store.paths import STORE
 from pipeline.store.schema import read_specs
 
@@ -52,8 +51,16 @@ def held(target: Path) -> Iterator[int]:
             process.kill()
 
 
-def entry(inventory: Inventory, name: str) -> StoreEntry:
-    return next(one for one in inventory.entries if one.path.name == name)
+def entry(folder: Path, name: str) -> StoreEntry:
+    return next(one for one in list_stores(folder) if one.path.name == name)
+
+
+def table(folder: Path) -> list[str]:
+    return describe_stores(folder, list_stores(folder), {})
+
+
+def unneeded(folder: Path) -> list[StoreEntry]:
+    return [one for one in list_stores(folder) if fate_of(one)[0] == "unneeded"]
 
 
 def unfinish(store: Path, done: int) -> Path:
@@ -73,39 +80,22 @@ def hold(store: Path) -> None:
     shutil.copytree(store, held / store.name)
 
 
-class TestInventory:
+class TestListing:
     def test_a_store(self, tiny_store: Make, tmp_path: Path) -> None:
         path = tiny_store(tmp_path)
-        found = entry(take_inventory(tmp_path), "tiny.zarr")
-        assert (found.kind, found.damage) == ("store", None)
-        held = found.contents
-        assert held is not None
-        assert (held.said.plan, held.rows, held.done) == (
-            FeatureStore.open(path).attrs["plan"],
-            60,
-            60,
-        )
-        assert held.specs["vl/features"].shape == (60, 3, 8)
+        found = entry(tmp_path, "tiny.zarr")
+        assert (found.kind, found.damage, found.done) == ("store", None, 60)
+        assert found.attributes is not None
+        assert found.attributes.plan == FeatureStore.open(path).attrs["plan"]
+        assert found.specs["vl/features"].shape == (60, 3, 8)
         used = sum(file.stat().st_blocks * 512 for file in path.rglob("*") if file.is_file())
         assert found.bytes == used
 
     def test_a_build_says_how_much_of_it_is_done(self, tiny_store: Make, tmp_path: Path) -> None:
         unfinish(tiny_store(tmp_path), 25)
-        found = entry(take_inventory(tmp_path), "tiny.zarr.part")
-        assert found.kind == "build"
-        assert found.contents is not None
-        assert (found.contents.done, found.contents.rows) == (25, 60)
-        assert "25 of 60" in "\n".join(describe_inventory(take_inventory(tmp_path), {}))
-
-    def test_hard_links_are_counted_once_and_said(self, tiny_store: Make, tmp_path: Path) -> None:
-        path = tiny_store(tmp_path)
-        twin = path.with_name("twin.zarr")
-        shutil.copytree(path, twin, copy_function=os.link)
-        inventory = take_inventory(tmp_path)
-        one = entry(inventory, "twin.zarr")
-        assert inventory.bytes == one.bytes
-        said = "\n".join(describe_inventory(inventory, {}))
-        assert "of hard links counted once" in said
+        found = entry(tmp_path, "tiny.zarr.part")
+        assert (found.kind, found.done) == ("build", 25)
+        assert "25 of 60" in "\n".join(table(tmp_path))
 
     @pytest.mark.parametrize(
         ("harm", "said"),
@@ -125,10 +115,9 @@ class TestInventory:
     ) -> None:
         harm(tiny_store(tmp_path, name="damaged"))
         tiny_store(tmp_path, name="sound")
-        inventory = take_inventory(tmp_path)
-        assert said in (entry(inventory, "damaged.zarr").damage or "")
-        assert entry(inventory, "sound.zarr").damage is None
-        lines = describe_inventory(inventory, {})
+        assert said in (entry(tmp_path, "damaged.zarr").damage or "")
+        assert entry(tmp_path, "sound.zarr").damage is None
+        lines = table(tmp_path)
         assert any(line.startswith("damaged.zarr  damaged") for line in lines)
         assert any(said in line for line in lines)
 
@@ -136,39 +125,34 @@ class TestInventory:
         path = tiny_store(tmp_path)
         tiny_store(tmp_path, name="other", seed=1)
         archive(path, tmp_path / "tiny.archive.zarr", level=1, threads=1)
-        inventory = take_inventory(tmp_path)
-        found = entry(inventory, "tiny.archive.zarr")
-        assert found.kind == "archive"
-        lines = describe_inventory(inventory, {})
+        assert entry(tmp_path, "tiny.archive.zarr").kind == "archive"
+        lines = table(tmp_path)
         assert any(line.startswith("tiny.archive.zarr  archive") for line in lines)
 
     def test_who_builds(self, tiny_store: Make, tmp_path: Path) -> None:
         part = unfinish(tiny_store(tmp_path), 0)
         target = part.with_name("tiny.zarr")
         with held(target) as process:
-            assert take_inventory(tmp_path).holders[target].startswith(f"process {process} on")
-            said = "\n".join(describe_inventory(take_inventory(tmp_path), {}))
-            assert f"being built by process {process}" in said
-        assert take_inventory(tmp_path).holders == {}
+            assert f"being built by process {process} on" in "\n".join(table(tmp_path))
+        assert entry(tmp_path, part.name).holder is None
 
     def test_asking_does_not_stand_in_a_builders_way(self, tmp_path: Path) -> None:
-        with build_lock(tmp_path / "s.zarr"):
-            pass
-        take_inventory(tmp_path).holders  # noqa: B018
-        with build_lock(tmp_path / "s.zarr"):
-            assert list(take_inventory(tmp_path).holders) == [tmp_path / "s.zarr"]
+        for _ in range(2):
+            with build_lock(tmp_path / "s.zarr"):
+                assert f"process {os.getpid()} on" in (entry(tmp_path, "s.zarr.lock").holder or "")
+            assert entry(tmp_path, "s.zarr.lock").holder is None
 
     def test_subfolders_are_looked_into_but_not_stores(
         self, tiny_store: Make, tmp_path: Path
     ) -> None:
         inner = tiny_store(tmp_path / "deep" / "er")
         (inner / "inside.zarr").mkdir()
-        assert [one.path for one in take_inventory(tmp_path).entries] == [inner]
+        assert [one.path for one in list_stores(tmp_path)] == [inner]
 
     def test_no_folder(self, tmp_path: Path) -> None:
         with pytest.raises(ConfigError, match=r"stores\.folder"):
-            take_inventory(tmp_path / "nowhere")
-        assert describe_inventory(take_inventory(tmp_path), {}) == [f"{tmp_path}: no store in it"]
+            list_stores(tmp_path / "nowhere")
+        assert table(tmp_path) == [f"{tmp_path}: no store in it"]
 
 
 class TestLeftovers:
@@ -178,7 +162,7 @@ class TestLeftovers:
         path = tiny_store(tmp_path)
         archive(path, tmp_path / "tiny.archive.zarr", level=1, threads=1)
         os.truncate(tiny_store(tmp_path, name="bad") / "vl/features/c/0/0/0", 99)
-        kinds = {one.entry.path.suffix for one in find_leftovers(take_inventory(tmp_path))}
+        kinds = {one.path.suffix for one in unneeded(tmp_path)}
         assert kinds <= {".lock"}
 
     def test_each_is_named_with_its_reason_and_removed(
@@ -187,28 +171,20 @@ class TestLeftovers:
         tiny_store(tmp_path)
         unfinish(tiny_store(tmp_path, name="none"), 0)
         (tmp_path / "new.zarr.part").mkdir()
-        shutil.copytree(tmp_path / "tiny.zarr", tmp_path / "tiny.zarr.repair.part")
-        hold(tmp_path / "tiny.zarr")
-        for name in (
-            "gone.zarr.files.sqlite",
-            "tiny.zarr.files.sqlite",
-            "tiny.zarr.lock",
-        ):
+        (tmp_path / "tiny.zarr.repair.part").mkdir()
+        for name in ("gone.zarr.files.sqlite", "tiny.zarr.files.sqlite", "tiny.zarr.lock"):
             (tmp_path / name).touch()
-        found = find_leftovers(take_inventory(tmp_path))
-        assert {one.entry.path.name: one.why for one in found} == {
+        found = unneeded(tmp_path)
+        stopped = "a build that was stopped before any row was done"
+        assert {one.path.name: fate_of(one)[1] for one in found} == {
             "gone.zarr.files.sqlite": "content digests for a store that is not there",
-            "new.zarr.part": "a build that was stopped before any row was done; there is nothing "
-            "to resume",
-            "none.zarr.part": "a build that was stopped before any row was done; there is nothing "
-            "to resume",
+            "new.zarr.part": stopped,
+            "none.zarr.part": stopped,
             "tiny.zarr.lock": "held by no process",
-            "tiny.zarr.replaced": "another store has taken its place",
-            "tiny.zarr.repair.part": "a repair that was stopped before it was a build; the next "
-            "begins anew",
+            "tiny.zarr.repair.part": stopped,
         }
         for one in found:
-            remove_leftover(one)
+            remove_entry(one)
         assert sorted(os.listdir(tmp_path)) == ["tiny.zarr", "tiny.zarr.files.sqlite"]
         assert FeatureStore.open(tmp_path / "tiny.zarr").ticks == 180
 
@@ -216,50 +192,56 @@ class TestLeftovers:
         begun = unfinish(tiny_store(tmp_path, name="begun"), 12)
         store = tiny_store(tmp_path)
         aside = Path(shutil.copytree(store, tmp_path / "tiny.zarr.known-0"))
+        hold(store)
         unread = Path(shutil.copytree(begun, tmp_path / "unread.zarr.part"))
-        (unread / "vl" / "key" / "zarr.json").write_text("{")
-        inventory = take_inventory(tmp_path)
-        assert find_leftovers(inventory) == []
-        lines = describe_kept(inventory)
+        (unread / "vl" / "checksum" / "zarr.json").write_text("{")
+        inside = Path(shutil.copytree(begun, tmp_path / "tiny.zarr.part" / ".known" / "0"))
+        mark(inside.parents[1], STORE)
+        part, replaced = inside.parents[1], tmp_path / "tiny.zarr.replaced"
+        named = [begun, aside, part, replaced, unread]
+        entries = list_stores(tmp_path)
+        assert unneeded(tmp_path) == []
+        lines = describe_kept(entries)
         assert lines[0] == (
-            f"{begun}: unfinished build, 12 of 60 rows done; stages.extract takes them over, and "
+            f"{begun}: unfinished build with 12 feature rows; the same command goes on, and "
             f"python -m stages.store gc {begun} --remove removes it"
         )
-        assert (
-            f"{aside}: unfinished build, 60 of 60 rows done; stages.extract takes them" in lines[1]
-        )
-        assert f"{unread}: unfinished build that cannot be read" in lines[2]
+        assert len(lines) == len(named)
+        assert f"{aside}: unfinished build with 60 feature rows" in lines[1]
+        assert f"{part}: unfinished build with 12 feature rows" in lines[2]
+        assert f"{unread}: unfinished build that cannot be read" in lines[4]
         for path in (store, tmp_path / "gone.zarr.part"):
             with pytest.raises(ConfigError, match=rf"{path}: .*Nothing was removed"):
-                find_named(inventory, [begun, path])
-        for one in find_named(inventory, [begun, aside, unread]):
-            remove_leftover(one)
+                find_named(entries, [begun, path])
+        for one in find_named(entries, named):
+            remove_entry(one)
         assert os.listdir(tmp_path) == ["tiny.zarr"]
 
-    def test_the_only_copy_of_a_store_is_no_leftover(
+    def test_the_only_copy_of_a_store_is_never_removed(
         self, tiny_store: Make, tmp_path: Path
     ) -> None:
         """A kill between the two renames of a replacement leaves it in `.replaced`."""
         path = tiny_store(tmp_path)
         hold(path)
-        found = find_leftovers(take_inventory(tmp_path))
-        listed = next(one for one in found if one.entry.path.suffix == ".replaced")
+        (listed,) = find_named(list_stores(tmp_path), [tmp_path / "tiny.zarr.replaced"])
         shutil.rmtree(path)
-        assert find_leftovers(take_inventory(tmp_path)) == []
-        assert "the only copy of tiny.zarr" in describe_kept(take_inventory(tmp_path))[0]
-        remove_leftover(listed)  # found while the store was still there
-        assert (tmp_path / "tiny.zarr.replaced").exists()
+        assert unneeded(tmp_path) == []
+        assert "the only copy of tiny.zarr" in describe_kept(list_stores(tmp_path))[0]
+        with pytest.raises(ConfigError, match="the only copy"):
+            find_named(list_stores(tmp_path), [listed.path])
+        remove_entry(listed)  # listed while the store was still there
+        assert listed.path.exists()
 
     def test_what_is_being_built_is_not_touched(self, tiny_store: Make, tmp_path: Path) -> None:
         part = unfinish(tiny_store(tmp_path), 5)
-        (listed,) = find_named(take_inventory(tmp_path), [part])
+        (listed,) = find_named(list_stores(tmp_path), [part])
         with held(tmp_path / "tiny.zarr") as process:
-            inventory = take_inventory(tmp_path)
+            entries = list_stores(tmp_path)
             with pytest.raises(ConfigError, match="in use by process"):
-                find_named(inventory, [part])
-            assert describe_kept(inventory)[0].startswith(f"{part}: in use by process {process}")
+                find_named(entries, [part])
+            assert describe_kept(entries)[0].startswith(f"{part}: in use by process {process}")
             with pytest.raises(StoreLocked, match="not removed"):
-                remove_leftover(listed)
+                remove_entry(listed)
         assert part.exists()
 
     @pytest.mark.parametrize("damaged", [False, True])
@@ -271,7 +253,7 @@ class TestLeftovers:
         damaged: bool,
     ) -> None:
         part = unfinish(tiny_store(tmp_path / "stores"), 0)
-        (leftover,) = find_leftovers(take_inventory(part.parent))
+        (leftover,) = unneeded(part.parent)
         if damaged:
             (part / "zarr.json").write_text("{")
 
@@ -281,7 +263,7 @@ class TestLeftovers:
 
         monkeypatch.setattr("pipeline.base.ownership.shutil.rmtree", killed)
         with pytest.raises(KeyboardInterrupt):
-            remove_leftover(leftover)
+            remove_entry(leftover)
         assert any(part.iterdir())
         assert STORE.owns(part)
 
@@ -289,25 +271,25 @@ class TestLeftovers:
         self, tiny_store: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         kept = previous_path(tmp_path / "stores" / "tiny.zarr")
-        tiny_store(tmp_path / "stores").rename(kept)
+        shutil.copytree(tiny_store(tmp_path / "stores"), kept)
         mark(kept, KEPT)
-        (leftover,) = find_named(take_inventory(kept.parent), [kept])
+        (leftover,) = find_named(list_stores(kept.parent), [kept])
 
         def killed(path: Path) -> None:
             raise KeyboardInterrupt
 
         monkeypatch.setattr("pipeline.base.ownership.shutil.rmtree", killed)
         with pytest.raises(KeyboardInterrupt):
-            remove_leftover(leftover)
+            remove_entry(leftover)
         assert KEPT.owns(kept)
 
-    def test_a_foreign_file_at_a_ledger_is_no_leftover(self, tmp_path: Path) -> None:
-        ledger = tmp_path / "gone.zarr.files.sqlite"
-        ledger.write_text("years of work")
-        inventory = take_inventory(tmp_path)
-        assert find_leftovers(inventory) == []
+    @pytest.mark.parametrize("suffix", ["files.sqlite", "lock", "part", "previous"])
+    def test_a_foreign_file_is_no_leftover(self, tmp_path: Path, suffix: str) -> None:
+        foreign = tmp_path / f"gone.zarr.{suffix}"
+        foreign.write_text("years of work")
+        assert unneeded(tmp_path) == []
         with pytest.raises(ConfigError, match="did not write"):
-            find_named(inventory, [ledger])
+            find_named(list_stores(tmp_path), [foreign])
 
     def test_nothing_behind_a_symbolic_link_is_touched(
         self, tiny_store: Make, tmp_path: Path
@@ -317,15 +299,14 @@ class TestLeftovers:
         folder.mkdir()
         (folder / "tiny.zarr.part").symlink_to(outside)
         (folder / "more").symlink_to(outside.parent)
-        inventory = take_inventory(folder)
-        assert find_leftovers(inventory) == []
-        assert "a symbolic link" in describe_kept(inventory)[0]
+        assert unneeded(folder) == []
+        assert "a symbolic link" in describe_kept(list_stores(folder))[0]
         part = folder / "own.zarr.part"
         part.mkdir()
         (part / MARKER).write_text("a feature store\n")
         (part / "inside").symlink_to(outside)
-        for one in find_leftovers(take_inventory(folder)):
-            remove_leftover(one)
+        for one in unneeded(folder):
+            remove_entry(one)
         assert not part.exists()
         assert outside.exists()
         assert (outside / "zarr.json").exists()

@@ -1,0 +1,164 @@
+"""VL rows on their way into a build: read, known or made ready for the model, written, marked.
+
+Any process may write features; the coordinating one alone marks them, and only then do they count.
+"""
+
+import threading
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import groupby
+from operator import attrgetter
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from tqdm import tqdm
+
+from pipeline.data.row_range import Frames, RowFrames, RowRange
+from pipeline.extract.survey import Survey
+from pipeline.store import FEATURES, RowSource, StoreBuild
+from pipeline.vlm.preparation import PreparedRow, Preparer
+
+
+@dataclass(frozen=True)
+class KnownRow:
+    """A row that an older store or build has."""
+
+    row: int
+    key: bytes
+    features: NDArray[Any]
+    environment: dict[str, Any]
+
+
+@dataclass(frozen=True)
+class ReadyRow:
+    """A row ready for the model: its frames as they are, then augmented; all of one shape.
+
+    `where` is recording and row, for messages.
+    """
+
+    row: int
+    key: bytes
+    variants: tuple[PreparedRow, ...]
+    where: str
+
+
+@dataclass(frozen=True)
+class RepeatedRow:
+    """A row with the same frames and prompt as `first`; the model runs only on `first`."""
+
+    row: int
+    key: bytes
+    first: int
+
+
+Row = KnownRow | ReadyRow | RepeatedRow
+
+
+class RowPreparation:
+    """Turns row ranges into rows; used from several threads."""
+
+    def __init__(self, surveyed: Survey, known: Sequence[RowSource]) -> None:
+        """Rows whose key is in `known` are taken from there."""
+        self._preparer = Preparer(surveyed.params.vlm, surveyed.spec)
+        self._spec = surveyed.spec
+        self._known = known
+        self._lock = threading.Lock()
+
+    def prepare(self, rows: RowRange, firsts: dict[bytes, int] | None = None) -> list[Row]:
+        """The rows of a range; each decoded frame is held only while its row is made.
+
+        `firsts` notes the first row of each key, and only that one is made ready; without it, all
+        rows are. Raises what the recording raises.
+        """
+        prompt = self._preparer.render(rows.recording.instruction, list(rows.frames))
+        return [self._row(rows, row, frames, prompt, firsts) for row, frames in rows.read()]
+
+    def _row(
+        self, rows: RowRange, row: int, frames: Frames, prompt: str, firsts: dict[bytes, int] | None
+    ) -> Row:
+        key = self._spec.row_key(prompt, frames)
+        with self._lock:
+            for source in self._known:
+                if (taken := source.take(key)) is not None:
+                    return KnownRow(row, key, *taken)
+            first = row if firsts is None else firsts.setdefault(key, row)
+        if first != row:
+            return RepeatedRow(row, key, first)
+        recording = rows.recording
+        variants = self._preparer.prepare_variants(recording.instruction, frames, key)
+        return ReadyRow(row, key, variants, f"{recording.path}, VL row {row}")
+
+
+@dataclass(frozen=True)
+class WrittenRows:
+    """Feature rows that lie in the build and are not marked yet."""
+
+    origin: Literal["computed", "known", "repeated"]
+    rows: NDArray[np.int64]
+    keys: Sequence[bytes]
+    checksums: NDArray[np.uint32]
+    environment: Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class FeatureBlock:
+    """Rows of one environment with their features (row, variant x slot, dim), as they are stored.
+
+    The features of repeated rows are None: they are read from their firsts.
+    """
+
+    origin: Literal["computed", "known", "repeated"]
+    rows: Sequence[Row]
+    features: NDArray[Any] | None
+    environment: Mapping[str, Any]
+
+    def write(self, build: StoreBuild) -> WrittenRows:
+        """Write the features and wait for the disk."""
+        features = self.features
+        if features is None:
+            firsts = [row.first for row in self.rows if isinstance(row, RepeatedRow)]
+            files = build.files(FEATURES)
+            features = np.concatenate([files.read(first, 1) for first in firsts])
+        rows, keys = np.array([row.row for row in self.rows]), [row.key for row in self.rows]
+        checksums = build.write_features(rows, features)
+        return WrittenRows(self.origin, rows, keys, checksums, self.environment)
+
+
+def known_blocks(rows: Sequence[KnownRow]) -> Iterator[FeatureBlock]:
+    """Consecutive known rows of one environment as blocks."""
+    for environment, alike in groupby(rows, attrgetter("environment")):
+        block = list(alike)
+        features = np.stack([row.features for row in block])
+        yield FeatureBlock("known", block, features, environment)
+
+
+class RowMarks:
+    """Marks written rows in the build, counts them by origin and moves the progress bar."""
+
+    def __init__(self, build: StoreBuild, bar: "tqdm[Any]") -> None:
+        self.build = build
+        self.counts: Counter[str] = Counter()
+        self._bar = bar
+
+    def mark(self, written: Iterable[WrittenRows]) -> None:
+        """Mark rows, those of one environment together: each mark waits for the disk."""
+        for environment, alike in groupby(written, attrgetter("environment")):
+            blocks = list(alike)
+            rows = np.concatenate([block.rows for block in blocks])
+            keys = [key for block in blocks for key in block.keys]
+            checksums = np.concatenate([block.checksums for block in blocks])
+            self.build.mark(rows, keys, checksums, self.build.environment_index(environment))
+            self._bar.update(len(rows))
+            for block in blocks:
+                self.counts[block.origin] += len(block.rows)
+
+
+def row_frames(build: StoreBuild, surveyed: Survey) -> RowFrames:
+    """The frames of a laid-out build's rows, by the times in it: no stream is read again."""
+    vl_start, frame_time = (
+        build.files(name).read(0, build.specs[name].shape[0])
+        for name in ("episode/vl_start", "vl/frame_time")
+    )
+    return RowFrames(surveyed.recordings, vl_start, frame_time, surveyed.spec.views)

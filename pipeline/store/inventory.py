@@ -1,0 +1,306 @@
+"""What lies in a folder of stores: as a table for people, and what of it may be removed.
+
+Metadata and a few small arrays are read, whatever the size. A damaged store is listed with the
+reason and stops nothing. Never removed: a finished store or its only copy, an archive, what a
+living process is building, what this project did not write, what lies behind a symbolic link. What
+holds feature rows is removed only by name: the next run resumes it or takes its rows over.
+"""
+
+import re
+import stat
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
+from glob import escape
+from pathlib import Path
+from textwrap import shorten
+from typing import Literal
+
+import numpy as np
+
+from pipeline.base.commands import command
+from pipeline.base.digests import is_ledger
+from pipeline.base.durable import HELD, KEPT
+from pipeline.base.errors import ConfigError, PipelineError, StoreIncomplete, StoreLocked
+from pipeline.base.format import size
+from pipeline.base.ownership import LEDGER_SUFFIX, OutputKind, remove_folder
+from pipeline.base.table import Table
+from pipeline.store.archive import ARCHIVE, is_archive, read_manifest
+from pipeline.store.border import StoreAttributes
+from pipeline.store.chunks import read_rows
+from pipeline.store.lock import build_lock, lock_holder
+from pipeline.store.paths import STORE, is_store, laid_out_attributes
+from pipeline.store.reader import FeatureStore
+from pipeline.store.repair_hints import gc_command
+from pipeline.store.schema import CHECKSUMS, FEATURES, ArraySpec, read_spec, read_specs
+
+Fate = Literal["unneeded", "by name", "kept"]
+
+# What lies there, by what its name has behind that of a store.
+_KINDS = {
+    None: "store",
+    ".part": "build",
+    ".previous": "previous",
+    ".lock": "lock",
+    LEDGER_SUFFIX: "ledger",
+    **dict.fromkeys((".repair.part", ".known", ".replaced", ".keeping"), "left over"),
+}
+_NAME = re.compile(r"(?P<base>.+?\.zarr)(?P<suffix>\.[a-z.]+?)?(?:-(?:\d+|wal|shm))?")
+_SPEC_ENTRIES = ("processor", "weights", "adapter", "compute_dtype", "variants", "prompt")
+
+
+@dataclass(frozen=True)
+class StoreEntry:
+    """A store, an archive, or what lies beside the store `base` and belongs to it.
+
+    `bytes` are those on the disk. Stores, archives and builds have `attributes` and `specs`; `done`
+    of their feature rows are there. `damage` is the reason why one cannot be used, `holder` the
+    living process that has the lock of `base`.
+    """
+
+    path: Path
+    kind: str
+    base: Path
+    bytes: int
+    attributes: StoreAttributes | None = None
+    specs: Mapping[str, ArraySpec] = field(default_factory=dict)
+    done: int = 0
+    damage: str | None = None
+    holder: str | None = None
+
+
+def list_stores(folder: Path, *, subfolders: bool = True) -> list[StoreEntry]:
+    """Everything in `folder` and its subfolders that belongs to a store, by path.
+
+    Raises `ConfigError` where there is no such folder.
+    """
+    if not folder.is_dir():
+        raise ConfigError(
+            f"stores.folder: expected a folder of stores, found none at {folder}. Name it with "
+            "--set stores.folder=…"
+        )
+    return [_entry(*place) for place in _walk(folder, subfolders)]
+
+
+def describe_stores(
+    folder: Path, entries: Sequence[StoreEntry], dependents: Mapping[Path, Sequence[str]]
+) -> list[str]:
+    """Lines for people: a table, below each store its `dependents`, then the feature specs."""
+    shown = [entry for entry in entries if entry.kind != "lock"]
+    if not shown:
+        return [f"{folder}: no store in it"]
+    heads = ("", "what", "on disk", "episodes", "ticks", "VL rows", "spec")
+    header, *rows = Table(heads, [_row(folder, entry) for entry in shown]).text()
+    lines = [header]
+    for entry, row in zip(shown, rows, strict=True):
+        details = [*_details(entry), *dependents.get(entry.path, ())]
+        lines += [row, *(f"    {line}" for line in details)]
+    specs = dict(_spec(entry) for entry in shown if entry.attributes)
+    return [*lines, "", *(f"spec {digest}: {text}" for digest, text in specs.items())]
+
+
+def fate_of(entry: StoreEntry) -> tuple[Fate, str]:
+    """Whether an entry may be removed: if nobody needs it, only by name, or not; with the reason.
+
+    Looks at the disk: what is beside it may have changed since it was listed.
+    """
+    path, kind = entry.path, entry.kind
+    if kind in ("store", "archive"):
+        return "kept", f"a finished {kind}, which is never removed here"
+    if path.is_symlink():
+        return "kept", "a symbolic link, left alone"
+    if not _is_ours(entry):
+        return "kept", "this project did not write it, left alone"
+    if entry.holder:
+        return "kept", f"in use by {entry.holder}"
+    if kind == "lock":
+        return "unneeded", "held by no process"
+    if kind == "ledger":
+        if any(other.is_dir() for other in path.parent.glob(f"{escape(entry.base.name)}*")):
+            return "kept", "content digests for a store that is there"
+        return "unneeded", "content digests for a store that is not there"
+    inside = [at for at in (*path.glob("*"), *path.glob(".*/*")) if not at.is_symlink()]
+    stores = [path] if kind == "previous" else []
+    try:
+        stores += filter(is_store, inside)
+        done = sum(_done(store) for store in {path, *stores} if is_store(store))
+    except PipelineError as error:
+        return "by name", f"unfinished build that cannot be read: {_first_clause(str(error))}"
+    if not entry.base.exists() and any(laid_out_attributes(store).seal for store in stores):
+        return "kept", f"the only copy of {entry.base.name}, which a killed replacement left there"
+    if kind == "previous":
+        return "by name", "the store before, kept until the next successful run"
+    if done:
+        return "by name", f"unfinished build with {done} feature rows; the same command goes on"
+    return "unneeded", "a build that was stopped before any row was done"
+
+
+def find_named(entries: Sequence[StoreEntry], paths: Sequence[Path]) -> list[StoreEntry]:
+    """The entries at these paths, builds with their rows among them.
+
+    Raises `ConfigError` for a path that may not be removed, with the reason.
+    """
+    known = {entry.path.absolute(): entry for entry in entries}
+    for path in paths:
+        entry = known.get(path.absolute())
+        fate, why = fate_of(entry) if entry else ("kept", "no leftover of a build")
+        if fate == "kept":
+            raise ConfigError(
+                f"stores.inputs: {path}: {why}. Nothing was removed; "
+                f"{command('store', 'gc')} lists what may be."
+            )
+    return [known[path.absolute()] for path in paths]
+
+
+def describe_kept(entries: Sequence[StoreEntry]) -> list[str]:
+    """What looks like a leftover and stays, with the reason, a line each."""
+    lines: list[str] = []
+    for entry in entries:
+        fate, why = fate_of(entry)
+        if fate == "by name":
+            lines.append(f"{entry.path}: {why}, and {gc_command(entry.path)} removes it")
+        elif fate == "kept" and entry.kind in ("build", "previous", "left over"):
+            lines.append(f"{entry.path}: {why}")
+    return lines
+
+
+def remove_entry(entry: StoreEntry) -> None:
+    """Remove an entry, unless it may no longer be; takes the lock of its store meanwhile.
+
+    Raises `StoreLocked` where a build has begun since.
+    """
+    path, lock = entry.path, entry.base.with_name(entry.base.name + ".lock")
+    there = lock.exists()
+    try:
+        with build_lock(entry.base):
+            if fate_of(entry)[0] == "kept":
+                return
+            if path.is_dir():
+                remove_folder(path, _owner(path) or STORE)
+            else:
+                path.unlink(missing_ok=True)
+            if not there:
+                lock.unlink(missing_ok=True)
+    except StoreLocked as error:
+        raise StoreLocked(f"{path}: not removed. {error}") from None
+
+
+def _walk(folder: Path, subfolders: bool) -> Iterator[tuple[Path, str, Path]]:
+    """What belongs to a store, at or below a folder; links to folders are not followed."""
+    for path in sorted(folder.iterdir()):
+        name = _NAME.fullmatch(path.name)
+        if name and name["suffix"] in _KINDS:
+            yield path, _KINDS[name["suffix"]], path.with_name(name["base"])
+        elif subfolders and path.is_dir() and not path.is_symlink():
+            yield from _walk(path, subfolders)
+
+
+def _entry(path: Path, kind: str, base: Path) -> StoreEntry:
+    lock = base.with_name(base.name + ".lock")
+    holder = damage = None
+    try:
+        holder = lock_holder(lock) if lock.is_file() else None
+    except PipelineError as error:  # a file that is no lock tells nothing of the others
+        damage = str(error) if kind == "lock" else None
+    entry = StoreEntry(path, kind, base, _bytes(path), damage=damage, holder=holder)
+    try:
+        if kind == "store" and is_archive(path):
+            entry, manifest = replace(entry, kind="archive"), read_manifest(path)
+            specs, rows = manifest.specs(path), manifest.specs(path)[CHECKSUMS].shape[0]
+            return replace(entry, attributes=manifest.attributes(path), specs=specs, done=rows)
+        if kind == "store":
+            FeatureStore.open(path)
+        if kind == "store" or is_store(path):
+            root, specs = laid_out_attributes(path), read_specs(path)
+            return replace(entry, attributes=root, specs=specs, done=_done(path))
+    except PipelineError as error:  # the others are listed
+        return replace(entry, damage=str(error))
+    except OSError as error:  # removed meanwhile, or not to be read
+        return replace(entry, damage=f"{path}: {error.strerror}")
+    return entry
+
+
+def _bytes(path: Path) -> int:
+    """Bytes on the disk, each hard-linked file once."""
+    used: dict[tuple[int, int], int] = {}
+    for file in path.rglob("*") if path.is_dir() else [path]:
+        with suppress(OSError):  # removed meanwhile, or a link into an emptied cache
+            status = file.stat()  # of the file itself where a cache hands out symbolic links
+            if not stat.S_ISDIR(status.st_mode):
+                used[status.st_dev, status.st_ino] = status.st_blocks * 512
+    return sum(used.values())
+
+
+def _done(store: Path) -> int:
+    """Feature rows of a store or build that are there."""
+    return int(np.count_nonzero(read_rows(store, read_spec(store, CHECKSUMS))))
+
+
+def _row(folder: Path, entry: StoreEntry) -> tuple[object, ...]:
+    name = entry.path.relative_to(folder).as_posix()
+    row = (name, "damaged" if entry.damage else entry.kind, size(entry.bytes))
+    if entry.attributes is None:
+        return (*row, None, None, None, None)
+    arrays = ("episode/source", "tick/time", FEATURES)
+    episodes, ticks, rows = (entry.specs[array].shape[0] for array in arrays)
+    done = rows if entry.done == rows else f"{entry.done:,} of {rows:,}"
+    return (*row, episodes, ticks, done, _spec(entry)[0])
+
+
+def _details(entry: StoreEntry) -> Iterator[str]:
+    if entry.damage:
+        yield f"damaged: {_first_clause(entry.damage)}"
+    if (root := entry.attributes) and entry.kind == "store":
+        streams = ("tick/action", "sensor/values", "state/values")
+        action, sensor, state = (entry.specs[name].shape[1] for name in streams)
+        rate = "recorded rows" if root.action_hz is None else f"{root.action_hz:g} Hz"
+        yield (
+            f"{root.streams.action.kind} action {action}, sensor {sensor}, state {state}; {rate}, "
+            f"an answer every {root.vlm_reuse_count} ticks; sources {', '.join(root.sources)}"
+        ).strip()
+    if entry.holder and entry.kind != "archive":
+        doing = "being built" if entry.kind == "build" else "locked"
+        yield f"{doing} by {entry.holder}"
+
+
+def _spec(entry: StoreEntry) -> tuple[str, str]:
+    """The beginning of a feature spec's digest; its main entries, which tell two specs apart."""
+    assert entry.attributes is not None
+    features, document = entry.specs[FEATURES], entry.attributes.raw["feature_spec"]
+    slots = [f"{slot.pooling} of layer {slot.layer}" for slot in entry.attributes.slots]
+    named = {"pooling": " + ".join(dict.fromkeys(slots))}
+    named |= {name: document[name] for name in _SPEC_ENTRIES if document.get(name)}
+    return entry.attributes.feature_spec.digest[:8], ", ".join(
+        [
+            f"{features.shape[1]} slots x {features.shape[2]} in {features.stored_dtype}",
+            f"sensor in {entry.specs['sensor/values'].dtype.name}",
+            *(f"{name} {shorten(str(it), 60, placeholder='…')}" for name, it in named.items()),
+        ]
+    )
+
+
+def _first_clause(damage: str) -> str:
+    """What is wrong, without what to run about it."""
+    return damage.split(". ", 1)[0].splitlines()[0]
+
+
+def _is_ours(entry: StoreEntry) -> bool:
+    if entry.kind == "lock":
+        return entry.path.is_file() and entry.damage is None
+    if entry.kind == "ledger" and not entry.path.name.endswith(LEDGER_SUFFIX):
+        return entry.path.is_file()  # SQLite's own, beside it
+    return is_ledger(entry.path) if entry.kind == "ledger" else _owner(entry.path) is not None
+
+
+def _owner(path: Path) -> OutputKind | None:
+    """The kind that a folder is of, None where it is not ours.
+
+    The marker decides: removed as another kind and killed meanwhile, it would be foreign to the
+    command that looks for its own kind there.
+    """
+    kinds = (STORE, ARCHIVE, KEPT, HELD)
+    try:
+        marked = next((kind for kind in kinds if kind.marks(path)), None)
+        return marked or next((kind for kind in kinds if kind.owns(path)), None)
+    except StoreIncomplete:  # a group's metadata, but damaged
+        return OutputKind(STORE.name, lambda _: True)
