@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from pipeline.base.border import MOST_BYTES, Border
-from pipeline.base.durable import free_bytes
 from pipeline.base.errors import DiskFull, NumericsError, RecordingError
+from pipeline.base.files import free_bytes
 from pipeline.base.finite import first_non_finite
 from pipeline.base.format import size
 from pipeline.base.tuned_on import store_attributes

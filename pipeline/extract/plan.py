@@ -7,21 +7,19 @@ import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing
 from functools import cached_property
-from itertools import count
 from pathlib import Path
 from typing import Any
 
 from pipeline.base.config import setting
 from pipeline.base.differences import describe, differences
 from pipeline.base.digests import ContentDigests, joint_digest
-from pipeline.base.durable import KEPT, free_bytes, previous_path
 from pipeline.base.errors import StoreIncomplete, StoreMismatch
+from pipeline.base.files import free_bytes, refuse_foreign, remove_folder
 from pipeline.base.format import duration, size
-from pipeline.base.ownership import refuse_foreign, remove_folder
 from pipeline.data.embodiment import Embodiment
 from pipeline.extract.survey import CheckedEpisode, Survey
 from pipeline.store import FEATURES, RowSource, StoreBuild, part_path, read_plan
-from pipeline.store.paths import MERGED, STORE, is_store
+from pipeline.store.paths import KEPT, MERGED, builds_aside, previous_path, set_build_aside
 from pipeline.store.schema import ArraySpec, read_specs
 
 Say = Callable[[str], None]
@@ -42,11 +40,7 @@ class StorePlaces:
     def __init__(self, target: Path) -> None:
         self.target, self.part, self.previous = target, part_path(target), previous_path(target)
         self.begun, self.finished = read_plan(self.part), read_plan(target)
-        self.aside = [
-            path
-            for path in sorted(target.parent.glob(f"{target.name}.known-*"))
-            if path.name.rpartition("-")[2].isdigit() and is_store(path)
-        ]
+        self.aside = builds_aside(target)
         is_kept = KEPT.owns(self.previous) and read_plan(self.previous) is not None
         self.kept = [self.previous] if is_kept else []
 
@@ -90,8 +84,7 @@ class StorePlaces:
             for line in spec_differences(before.raw["feature_spec"], surveyed.spec.attrs()):
                 say(f"the unfinished build {self.part} is given up: {line}")
             return
-        names = (self.target.with_name(f"{self.target.name}.known-{n}") for n in count())
-        self.part.rename(next(path for path in names if not path.exists()))
+        set_build_aside(self.target)
 
     def keeping_note(self, surveyed: Survey) -> list[str]:
         """What a run says of episodes that it does not name: the store with them is kept once more.
@@ -119,8 +112,6 @@ class StorePlaces:
         keep = self._lost(surveyed) is not None
         with closing(build):
             build.seal(keep=keep)
-        for folder in self.aside:
-            remove_folder(folder, STORE)
         if keep:
             say(f"{self.previous}: the store of before, kept until the next successful run")
         else:

@@ -15,10 +15,9 @@ from tqdm import tqdm
 
 from pipeline.base.config import Params
 from pipeline.base.digests import ContentDigests, ledger_path
-from pipeline.base.durable import disk_full_named, sync
-from pipeline.base.durable import put_in_place as replace_folder
 from pipeline.base.errors import StoreMismatch
-from pipeline.base.ownership import begin_folder, remove_folder
+from pipeline.base.files import begin_folder, disk_full_named, remove_folder, sync
+from pipeline.base.files import put_in_place as replace_folder
 from pipeline.extract.layout import build_arrays, check_space, lay_out
 from pipeline.extract.plan import Say
 from pipeline.extract.survey import sound_episodes, survey

@@ -24,10 +24,16 @@ from numpy.typing import NDArray
 from pydantic import ConfigDict
 
 from pipeline.base.border import Document, Text
-from pipeline.base.durable import sync, write_document
 from pipeline.base.errors import RecordingError
+from pipeline.base.files import (
+    OutputKind,
+    begin_folder,
+    remove_folder,
+    sync,
+    unmark,
+    write_document,
+)
 from pipeline.base.finite import non_finite
-from pipeline.base.ownership import OutputKind, begin_folder, remove_folder, unmark
 from pipeline.data.lerobot import ACTION, STATE
 from pipeline.data.lerobot_writer import write_data_set, write_sidecar
 from pipeline.data.media import RECORDINGS

@@ -18,17 +18,24 @@ from typing import Literal
 
 import numpy as np
 
-from pipeline.base.digests import is_ledger
-from pipeline.base.durable import HELD, KEPT
+from pipeline.base.digests import LEDGER_SUFFIX, is_ledger
 from pipeline.base.errors import ConfigError, PipelineError, StoreIncomplete, StoreLocked
+from pipeline.base.files import HELD, OutputKind, remove_folder
 from pipeline.base.format import size
-from pipeline.base.ownership import LEDGER_SUFFIX, OutputKind, remove_folder
 from pipeline.base.table import Table
 from pipeline.store.archive import ARCHIVE, is_archive, read_manifest
 from pipeline.store.border import StoreAttributes
 from pipeline.store.chunks import read_rows
 from pipeline.store.lock import build_lock, lock_holder
-from pipeline.store.paths import MERGED, STORE, laid_out_attributes, read_plan
+from pipeline.store.paths import (
+    KEPT,
+    MERGED,
+    REPLACED,
+    STORE,
+    builds_aside,
+    laid_out_attributes,
+    read_plan,
+)
 from pipeline.store.reader import FeatureStore
 from pipeline.store.repair_hints import gc_command
 from pipeline.store.schema import CHECKSUMS, FEATURES, ArraySpec, read_specs
@@ -214,7 +221,8 @@ def remove_leftover(leftover: Leftover) -> None:
     try:
         with build_lock(base):
             # Looked at again under the lock: a killed replacement leaves the only copy there.
-            only_copy = _KINDS.get(path.suffix) == "replaced" and not base.exists()
+            held = _KINDS.get(path.suffix) == "replaced" or (path / REPLACED).exists()
+            only_copy = held and not base.exists()
             if path.is_symlink() or only_copy:
                 return
             if path.is_dir():
@@ -354,8 +362,8 @@ def _fate(inventory: Inventory, entry: StoreEntry) -> tuple[Fate, str]:
     sound = {other.kind for other in beside if other.damage is None}
     if entry.kind == "replaced" and not sound & {"store", "archive"}:
         return "kept", (
-            f"the only copy of {entry.base.name}, set aside by a replacement that was killed; the "
-            "next stages.extract puts it back"
+            f"the only copy of {entry.base.name}, set aside by a replacement that was killed; "
+            "stages.extract says where to move it"
         )
     if entry.kind == "ledger" and any(other.kind not in ("lock", "ledger") for other in beside):
         return "in place", "content digests for a store that is there"
@@ -366,6 +374,8 @@ def _work(entry: StoreEntry) -> str | None:
     """What would be lost with an unfinished build; None where that holds no row."""
     if entry.damage is not None:
         return f" that cannot be read: {_clause(entry.damage)}"
+    if entry.kind == "build" and (aside := builds_aside(entry.base)):
+        return f" with the rows of {len(aside)} other(s) in it; stages.extract takes them over"
     held = entry.contents
     if held is None or not held.done:
         return None

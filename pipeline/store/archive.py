@@ -34,9 +34,15 @@ from zarr.storage import LocalStore, StorePath
 
 from pipeline.base.border import Border, Document, Text, shown
 from pipeline.base.digests import file_digest
-from pipeline.base.durable import disk_full_named, put_in_place, sync
 from pipeline.base.errors import PipelineError, StoreIncomplete, StoreMismatch
-from pipeline.base.ownership import OutputKind, begin_folder, remove_folder
+from pipeline.base.files import (
+    OutputKind,
+    begin_folder,
+    disk_full_named,
+    put_in_place,
+    remove_folder,
+    sync,
+)
 from pipeline.store.border import Group, Length, StoreAttributes, store_border
 from pipeline.store.chunks import (
     Seal,
@@ -57,9 +63,9 @@ from pipeline.store.paths import (
     inode_of,
     laid_out_attributes,
     part_path,
-    read_plan,
     recover,
     refuse_replaced,
+    unfinished_plans,
 )
 from pipeline.store.reader import FeatureStore
 from pipeline.store.repair_hints import extract_command, gc_command
@@ -467,7 +473,7 @@ def _copy_golden(root: Path, to: Path, digests: Mapping[str, str]) -> None:
 def _refuse_build(target: Path) -> None:
     """An unfinished extraction or repair may hold rows that exist nowhere else, of any plan."""
     part = part_path(target)
-    if read_plan(part) is not None:
+    if unfinished_plans(target):
         raise StoreMismatch(
             f"{part}: expected nothing there, found an unfinished build. Finish it with "
             f"{extract_command(target)}, remove it with {gc_command(part)}, or set archive.store."

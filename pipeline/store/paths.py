@@ -1,18 +1,66 @@
-"""Where a store lies, what lies beside it, and whether what lies there is one."""
+"""The three places of a store, and the steps that take a build from one to the next.
 
+    <name>.zarr            the finished store, never modified
+    <name>.zarr.part       the build; `.known/<n>` in it are interrupted builds of other plans
+    <name>.zarr.previous   the store before, kept (and marked) for episodes that the new one lacks
+
+Whoever changes one of them holds `<name>.zarr.lock` and calls `recover` first. A part goes through
+these states; rows are known from the store, the previous one, a part with a plan and its `.known`:
+
+    begin_build      finish_layout        finish          put_in_place
+    ──────────► bare ────────────► laid out ─────► sealed ────────────► <name>.zarr
+                 ▲   (the plan is  │  ▲  │ rows are committed, batch by batch
+                 │    the last     │  └──┘
+                 │    thing)       │
+                 └─────────────────┘ set_build_aside: another plan begins
+
+A kill leaves:
+- a bare part: the next build empties it, `.known` stays.
+- a part laid out: the same plan goes on, another one sets it aside.
+- half of `set_build_aside`: `recover` completes it.
+- a sealed part without a store, which lies in `.replaced` of that part (from where `recover` brings
+  it back) or, where it is to be kept, as the previous one: the same plan only renames the part.
+- a new store with `.known` or `.replaced` still in it: `recover` removes these.
+"""
+
+import glob
+from itertools import count
 from pathlib import Path
 from typing import Any
 
 from pipeline.base.border import Border, shown
-from pipeline.base.durable import recover as recover_replaced
-from pipeline.base.errors import StoreIncomplete, StoreMismatch
-from pipeline.base.ownership import OutputKind, described, refuse_foreign, there
+from pipeline.base.errors import ConfigError, StoreIncomplete, StoreMismatch
+from pipeline.base.files import (
+    MARKER,
+    OutputKind,
+    begin_folder,
+    claim,
+    described,
+    is_aside_link,
+    refuse_foreign,
+    remove_folder,
+    set_aside,
+    sync,
+    there,
+    unmark,
+)
 from pipeline.store.border import Group, StoreAttributes
 from pipeline.store.repair_hints import extract_command, mend, restore_command, start_over
 from pipeline.store.schema import SCHEMA
 
 MERGED = "merge-"
 """How the plan of a store begins that was not extracted but merged."""
+
+KNOWN = ".known"
+REPLACED = ".replaced"
+_MOVED_LAST = ".zarr.json"
+"""What `set_build_aside` calls the metadata of a build until the rest of it has moved."""
+_EARLIER = {
+    "repair.part": "a repair that was stopped. Remove it, then repair again",
+    "replaced": "a store that was being replaced. Where {0} is gone, move {1} there; remove {2}",
+    "keeping": "a store that was being replaced. Where {0} is gone, move {1} there; remove {2}",
+}
+"""What versions before this one left beside a store when they were killed, and what to do."""
 
 Inode = tuple[int, int]
 
@@ -22,6 +70,11 @@ def part_path(target: Path) -> Path:
     return target.with_name(target.name + ".part")
 
 
+def previous_path(target: Path) -> Path:
+    """Where the store before is kept."""
+    return target.with_name(target.name + ".previous")
+
+
 def is_store(path: Path) -> bool:
     """Whether a store of this project, or a laid-out build of one, lies there."""
     attributes = group_attributes(path)
@@ -29,6 +82,8 @@ def is_store(path: Path) -> bool:
 
 
 STORE = OutputKind("a feature store", is_store)
+KEPT = OutputKind("a store of before, kept for its rows,", is_aside_link)
+"""The previous store, by its marker: a copy or a link that a user made there is none."""
 
 
 def refuse_foreign_store(target: Path) -> None:
@@ -38,12 +93,94 @@ def refuse_foreign_store(target: Path) -> None:
 
 
 def recover(target: Path) -> None:
-    """Undo or complete a replacement that a kill stopped, before anything is written there.
+    """Complete or undo what a kill stopped, before anything is written there.
 
-    Raises `ConfigError` where something lies there that this project did not write.
+    Raises `ConfigError` where something lies there that this project did not write, or that an
+    earlier version left.
     """
     refuse_foreign_store(target)
-    recover_replaced(target, STORE)
+    part = part_path(target)
+    for suffix, what in _EARLIER.items():
+        left = target.with_name(f"{target.name}.{suffix}")
+        if there(left):
+            todo = what.format(target, left / target.name, left)
+            raise ConfigError(f"{left}: an earlier version left {todo}, and run this again.")
+    if KEPT.marks(target):
+        unmark(target)
+    if not there(target) and there(part / REPLACED):
+        (part / REPLACED).rename(target)
+    _tidy(target)
+    for left in sorted(target.parent.glob(f"{glob.escape(target.name)}.known-*")):
+        if left.name.rpartition("-")[2].isdigit() and is_store(left):  # of earlier versions
+            for place in (part, part / KNOWN):
+                claim(place, STORE)
+            left.rename(_free(part / KNOWN))
+    for moving in part.glob(f"{KNOWN}/*/{_MOVED_LAST}"):
+        _move_build(part, moving.parent)
+
+
+def begin_build(target: Path) -> None:
+    """Make an empty part, in place of what was begun there; builds that were set aside stay."""
+    begin_folder(part_path(target), STORE, but=KNOWN)
+
+
+def set_build_aside(target: Path) -> None:
+    """Move the build into `.known` of its own part, where its rows stay known."""
+    part = part_path(target)
+    for place in (part, part / KNOWN):
+        claim(place, STORE)
+    folder = _free(part / KNOWN)
+    folder.mkdir()
+    (part / "zarr.json").rename(folder / _MOVED_LAST)
+    _move_build(part, folder)
+
+
+def builds_aside(target: Path) -> list[Path]:
+    """The builds that were set aside."""
+    return [path for path in sorted((part_path(target) / KNOWN).glob("*")) if is_store(path)]
+
+
+def unfinished_plans(target: Path) -> list[str]:
+    """The plans of the build and of those that were set aside."""
+    plans = (read_plan(place) for place in (part_path(target), *builds_aside(target)))
+    return [plan for plan in plans if plan is not None]
+
+
+def put_in_place(target: Path, keep: bool = False) -> None:
+    """Rename a sealed part to the store; remove what was there, or `keep` it as the previous one.
+
+    Of a store behind a symbolic link the link alone goes. Raises `ConfigError` where something that
+    is not this project's lies in one of the places.
+    """
+    part = part_path(target)
+    refuse_foreign(target, STORE)
+    unmark(part)
+    if keep and there(target):
+        set_aside(target, previous_path(target), KEPT)
+    elif target.is_symlink():
+        target.unlink()
+    elif target.exists():
+        target.rename(part / REPLACED)
+    part.rename(target)
+    sync(target.parent)
+    _tidy(target)
+
+
+def _tidy(target: Path) -> None:
+    """Remove from a store what came with it from its part."""
+    for name in (KNOWN, REPLACED):
+        remove_folder(target / name, STORE)
+
+
+def _free(known: Path) -> Path:
+    return next(path for number in count() if not (path := known / str(number)).exists())
+
+
+def _move_build(part: Path, folder: Path) -> None:
+    for entry in part.iterdir():
+        if entry.name not in (MARKER, KNOWN):
+            entry.rename(folder / entry.name)
+    (folder / _MOVED_LAST).rename(folder / "zarr.json")
 
 
 def read_plan(store: Path) -> str | None:

@@ -21,9 +21,8 @@ import numpy as np
 import zarr
 from numpy.typing import NDArray
 
-from pipeline.base.durable import disk_full_named, put_in_place, sync
 from pipeline.base.errors import StoreIncomplete
-from pipeline.base.ownership import begin_folder
+from pipeline.base.files import disk_full_named, sync
 from pipeline.store.border import store_border
 from pipeline.store.chunks import (
     ChunkFiles,
@@ -35,7 +34,7 @@ from pipeline.store.chunks import (
 )
 from pipeline.store.golden import GoldenFrames, write_golden
 from pipeline.store.metadata import metadata_damage, note_metadata
-from pipeline.store.paths import STORE, group_attributes, part_path
+from pipeline.store.paths import begin_build, group_attributes, part_path, put_in_place
 from pipeline.store.schema import CHECKSUMS, FEATURES, INCREMENTAL, KEYS, ArraySpec, chunk_path
 
 Rows = Sequence[int] | NDArray[np.int64]
@@ -131,7 +130,7 @@ class StoreBuild:
     def create(self) -> None:
         """Begin from nothing: metadata of every array, then the space for its rows."""
         with disk_full_named(self.part):
-            begin_folder(self.part, STORE)
+            begin_build(self.target)
             for spec in self.specs.values():
                 spec.create(self.part)
 
@@ -292,7 +291,7 @@ class StoreBuild:
 
     def put_in_place(self, keep: bool = False) -> None:
         """The second half of `seal`: an instant."""
-        put_in_place(self.part, self.target, STORE, keep=keep)
+        put_in_place(self.target, keep)
 
     def close(self) -> None:
         """Close every file."""

@@ -21,21 +21,19 @@ from pipeline.base.border import Document, Text
 from pipeline.base.channels import action_groups
 from pipeline.base.config import TrainHeadParams
 from pipeline.base.differences import differences
-from pipeline.base.durable import (
+from pipeline.base.errors import CheckpointIncomplete, CheckpointMismatch
+from pipeline.base.files import (
+    REPORT,
+    OutputKind,
+    begin_folder,
     put_in_place,
     read_document,
     recover,
     recover_folder,
-    write_with_digest,
-)
-from pipeline.base.errors import CheckpointIncomplete, CheckpointMismatch
-from pipeline.base.ownership import (
-    REPORT,
-    OutputKind,
-    begin_folder,
     refuse_foreign,
     remove_folder,
     unmark,
+    write_with_digest,
 )
 from pipeline.base.source import SourceDocument
 from pipeline.policy.checkpoint import CHECKPOINT, DOCUMENT, SOURCE_KEYS, check_policy

@@ -10,9 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.base.durable import HELD, KEPT, previous_path
 from pipeline.base.errors import ConfigError, StoreLocked
-from pipeline.base.ownership import MARKER, begin_folder, mark
+from pipeline.base.files import HELD, MARKER, begin_folder, mark
 from pipeline.store import FeatureStore, StoreBuild, build_lock
 from pipeline.store.admin import (
     Inventory,
@@ -25,7 +24,7 @@ from pipeline.store.admin import (
     take_inventory,
 )
 from pipeline.store.archive import archive
-from pipeline.store.paths import STORE
+from pipeline.store.paths import KEPT, STORE, previous_path, set_build_aside
 from pipeline.store.schema import read_specs
 
 Make = Callable[..., Path]
@@ -236,6 +235,15 @@ class TestLeftovers:
             remove_leftover(one)
         assert os.listdir(tmp_path) == ["tiny.zarr"]
 
+    def test_a_build_that_was_set_aside_is_work(self, tiny_store: Make, tmp_path: Path) -> None:
+        part = unfinish(tiny_store(tmp_path), 12)
+        set_build_aside(tmp_path / "tiny.zarr")
+        inventory = take_inventory(tmp_path)
+        assert find_leftovers(inventory) == []
+        assert describe_kept(inventory)[0].startswith(
+            f"{part}: unfinished build with the rows of 1 other(s) in it; stages.extract takes"
+        )
+
     def test_the_only_copy_of_a_store_is_no_leftover(
         self, tiny_store: Make, tmp_path: Path
     ) -> None:
@@ -279,7 +287,7 @@ class TestLeftovers:
             (part / "zarr.json").unlink(missing_ok=True)
             raise KeyboardInterrupt
 
-        monkeypatch.setattr("pipeline.base.ownership.shutil.rmtree", killed)
+        monkeypatch.setattr("pipeline.base.files.shutil.rmtree", killed)
         with pytest.raises(KeyboardInterrupt):
             remove_leftover(leftover)
         assert any(part.iterdir())
@@ -296,7 +304,7 @@ class TestLeftovers:
         def killed(path: Path) -> None:
             raise KeyboardInterrupt
 
-        monkeypatch.setattr("pipeline.base.ownership.shutil.rmtree", killed)
+        monkeypatch.setattr("pipeline.base.files.shutil.rmtree", killed)
         with pytest.raises(KeyboardInterrupt):
             remove_leftover(leftover)
         assert KEPT.owns(kept)

@@ -5,8 +5,8 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from pipeline.base.config import DataParams, Params
-from pipeline.base.durable import free_bytes
 from pipeline.base.errors import RecordingError
+from pipeline.base.files import free_bytes
 from pipeline.base.format import size
 from pipeline.base.issue import Issue
 from pipeline.base.memory import memory_bytes

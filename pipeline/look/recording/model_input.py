@@ -1,7 +1,7 @@
 """What the model and the policy get of a recording: samples, the batch, the prompt, its tokens."""
 
 from collections.abc import Mapping, Sequence
-from contextlib import closing
+from contextlib import closing, suppress
 from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
@@ -14,9 +14,10 @@ from numpy.typing import NDArray
 
 from pipeline.base.clock import CLOCK_SLACK_S
 from pipeline.base.config import Params, VLMParams
+from pipeline.base.digests import LEDGER_SUFFIX as LEDGER
 from pipeline.base.digests import ContentDigests, ledger_path
 from pipeline.base.errors import PipelineError, RecordingError
-from pipeline.base.ownership import LEDGER_SUFFIX as LEDGER
+from pipeline.base.files import REPORT, claim
 from pipeline.base.table import Table
 from pipeline.look.page.blocks import Block, Document, Text, TokenRun, Tokens
 from pipeline.look.page.style import INK, draw_frame, panels
@@ -249,7 +250,11 @@ def remembered_spec(params: Params, views: Sequence[str]) -> FeatureSpec:
     where a file of it has changed: digests are remembered in the ledger of `digest_ledger`. Raises
     `VLMError` where the checkpoint is not there or incomplete.
     """
-    with closing(ContentDigests.to_read(digest_ledger(params))) as digests:
+    ledger = digest_ledger(params)
+    if ledger.parent == params.inspect.output:
+        with suppress(OSError):
+            claim(ledger.parent, REPORT)
+    with closing(ContentDigests.to_read(ledger)) as digests:
         return feature_spec(params.vlm, params.extract.dtype, views, digests.of)
 
 
