@@ -2,7 +2,7 @@
 
 import json
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from itertools import takewhile
 from typing import Any
 
@@ -66,11 +66,15 @@ def check_space(
 
 
 def lay_out(
-    build: StoreBuild, checked: Sequence[CheckedEpisode], survey: Survey, known: Sequence[RowSource]
+    build: StoreBuild,
+    checked: Sequence[CheckedEpisode],
+    survey: Survey,
+    known: Sequence[RowSource],
+    carry: Callable[[], object] = lambda: None,
 ) -> None:
     """Write all but the feature rows; chunks of unchanged streams are linked from a finished store.
 
-    Raises `DiskFull` where the disk fills up.
+    `carry` writes feature rows before the build counts as laid out. Raises `DiskFull`.
     """
     build.create()
     for source, name, rows in _linkable(build, checked, known):
@@ -85,6 +89,7 @@ def lay_out(
     starts = {"sensor": 0, "state": 0}
     for episode in tqdm(checked, "streams", unit="episode", disable=None, leave=False):
         _write_streams(build, episode, starts)
+    carry()
     build.finish_layout(attributes, {"slots": attributes["slots"]})
 
 

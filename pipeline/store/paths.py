@@ -45,20 +45,25 @@ from pipeline.base.files import (
     unmark,
 )
 from pipeline.store.border import Group, StoreAttributes
-from pipeline.store.repair_hints import extract_command, mend, restore_command, start_over
+from pipeline.store.repair_hints import (
+    KNOWN,
+    extract_command,
+    mend,
+    restore_command,
+    start_over,
+)
 from pipeline.store.schema import SCHEMA
 
 MERGED = "merge-"
 """How the plan of a store begins that was not extracted but merged."""
 
-KNOWN = ".known"
 REPLACED = ".replaced"
 _MOVED_LAST = ".zarr.json"
 """What `set_build_aside` calls the metadata of a build until the rest of it has moved."""
 _EARLIER = {
-    "repair.part": "a repair that was stopped. Remove it, then repair again",
-    "replaced": "a store that was being replaced. Where {0} is gone, move {1} there; remove {2}",
-    "keeping": "a store that was being replaced. Where {0} is gone, move {1} there; remove {2}",
+    "repair.part": "a repair that was stopped: remove it",
+    "replaced": "a store while it replaced it: if there is no {0}, move {1} there; remove the rest",
+    "keeping": "a store while it replaced it: if there is no {0}, move {1} there; remove the rest",
 }
 """What versions before this one left beside a store when they were killed, and what to do."""
 
@@ -103,8 +108,8 @@ def recover(target: Path) -> None:
     for suffix, what in _EARLIER.items():
         left = target.with_name(f"{target.name}.{suffix}")
         if there(left):
-            todo = what.format(target, left / target.name, left)
-            raise ConfigError(f"{left}: an earlier version left {todo}, and run this again.")
+            todo = what.format(target, left / target.name)
+            raise ConfigError(f"{left}: an earlier version left {todo}. Then run this again.")
     if KEPT.marks(target):
         unmark(target)
     if not there(target) and there(part / REPLACED):
@@ -225,7 +230,7 @@ def find_attributes(root: Path) -> dict[str, Any]:
         )
     if "schema" not in attributes:
         part = root if build else part_path(root)
-        target = root.with_name(root.name.removesuffix(".part").removesuffix(".repair"))
+        target = root.with_name(root.name.removesuffix(".part"))
         found, then = "nothing there", f"Run {extract_command(target)}."
         if part.exists():
             found = f"only the unfinished build {part}"
