@@ -274,8 +274,8 @@ def disk_full_named(place: Path) -> Generator[None]:
         raise
     except (OSError, SafetensorError) as error:
         # safetensors says the number in words only.
-        said = any(f"(os error {number})" in str(error) for number in FULL)
-        if not said and getattr(error, "errno", None) not in FULL:
+        in_words = any(f"(os error {number})" in str(error) for number in FULL)
+        if not in_words and getattr(error, "errno", None) not in FULL:
             raise
         raise DiskFull(
             f"{place}: no space left on the device ({free_bytes(place) / 2**20:.0f} MiB free). "

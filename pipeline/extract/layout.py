@@ -41,8 +41,7 @@ def check_readable(build: StoreBuild, checked: Sequence[CheckedEpisode], survey:
     if len(text) > MOST_BYTES // 2:  # golden rows and environments come yet
         why = f"expected attributes of at most {MOST_BYTES // 2:,} bytes, found {len(text):,}"
         raise _READERS.refusal(where, why)
-    said = _READERS.parse_json(text, dict[str, Any], where)
-    StoreAttributes.of(build.target, said, _READERS)
+    StoreAttributes.of(build.target, _READERS.parse_json(text, dict[str, Any], where), _READERS)
     for name, spec in build.specs.items():
         array_of(spec.document, name, build.target / name / "zarr.json", _READERS)
 
@@ -126,7 +125,7 @@ def _linkable(
     for source in known:
         if source.path == build.target:
             pairs = zip(source.texts, checked, strict=False)
-            same = [*takewhile(lambda pair: pair[0].content == pair[1].said["content"], pairs)]
+            same = [*takewhile(lambda pair: pair[0].content == pair[1].fields["content"], pairs)]
             for stream in ("sensor", "state"):
                 rows = sum(episode.counts[stream] for _, episode in same)
                 yield source, f"{stream}/values", rows
@@ -175,7 +174,7 @@ def _attributes(checked: Sequence[CheckedEpisode], survey: Survey) -> dict[str, 
         "slots": survey.spec.document["slots"],
         "sources": [source.name for source in data.sources],
         "streams": embodiment_of(checked).document() | {"views": list(survey.spec.views)},
-        "action_hz": tick_hz((one.ticks.recorded_hz for one in checked), data.action_hz),
+        "action_hz": tick_hz((episode.ticks.recorded_hz for episode in checked), data.action_hz),
         "vlm_reuse_count": data.vlm_reuse_count,
         "environment": [],
         **store_attributes(tuned_on(survey.params.vlm)),

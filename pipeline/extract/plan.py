@@ -85,7 +85,7 @@ def _reasons(
     if before is None:
         yield "there is no store yet"
         return
-    lines = spec_differences(before.said.raw["feature_spec"], surveyed.spec.attrs())
+    lines = spec_differences(before.attributes.raw["feature_spec"], surveyed.spec.attrs())
     yield from (f"feature spec, {line}" for line in lines)
     digests = {text.digest for text in before.texts}
     changed = [episode for episode in surveyed.episodes if episode.digest not in digests]
@@ -103,7 +103,7 @@ def _reasons(
         if name != FEATURES and before.specs[name].dtype != spec.dtype
     ]
     yield from dtypes
-    if unrated := before.said.action_hz is None:
+    if unrated := before.attributes.action_hz is None:
         yield "the store does not say the rate of its ticks"
     if not (lines or changed or gone or dtypes or unrated):
         yield "the order of episodes, or how actions are derived, changed"
@@ -112,7 +112,7 @@ def _reasons(
 def _warnings(surveyed: Survey, before: RowSource | None, missing: int) -> Iterator[str]:
     """What may not be meant, each with the way out."""
     params, recordings, views = surveyed.params, surveyed.recordings, surveyed.spec.views
-    known = before.said.feature_spec.views if before else []
+    known = before.attributes.feature_spec.views if before else []
     if known and (added := set(views) - set(known)):
         having = sum(not added.isdisjoint(recording.view_names()) for recording in recordings)
         kept = setting("data.views", [view for view in known if view in views])
@@ -153,7 +153,7 @@ def count_known(
     """How many rows of these episodes are in `sources`, as far as can be told without a frame."""
     count = 0
     for episode in checked:
-        of = episode.said["content"], episode.said["instruction"]
+        of = episode.fields["content"], episode.fields["instruction"]
         times = set().union(*(source.keys_of(*of) for source in sources))
         rows = episode.ticks.frame_times(surveyed.spec.views)
         count += sum(row.tobytes() in times for row in rows)

@@ -128,7 +128,7 @@ def _survey_lines(surveyed: Survey) -> Iterator[str]:
                 yield f"source {source.name!r}: {path} is absolute, so DVC does not watch it"
     missing = [f"not there: {line}" for line in surveyed.missing]
     yield from capped(missing, "episodes that are not there", MOST_EPISODES)
-    depth = {(one.source, view) for one in surveyed.recordings for view in one.depth_views()}
+    depth = {(r.source, view) for r in surveyed.recordings for view in r.depth_views()}
     for source, view in sorted(depth):
         yield f"source {source!r}: view {view} is a depth map, no picture, and is left out"
     skipped = [f"skipped {bad.source}: {bad.reason}" for bad in surveyed.bad]
@@ -138,6 +138,6 @@ def _survey_lines(surveyed: Survey) -> Iterator[str]:
 def _timeline_lines(surveyed: Survey, checked: Sequence[CheckedEpisode]) -> Iterator[str]:
     if any(recording.has_poses for recording in surveyed.recordings):
         yield f"actions: rotations as {surveyed.action_rotation}"
-    rates = [(one.source, one.ticks.recorded_hz, one.ticks.fastest_hz) for one in checked]
+    rates = [(ep.source, ep.ticks.recorded_hz, ep.ticks.fastest_hz) for ep in checked]
     for source, note in rate_notes(rates, surveyed.params.data.action_hz).items():
         yield f"source {source!r}: {note}"

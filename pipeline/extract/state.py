@@ -78,7 +78,7 @@ class StorePlaces:
     def set_build_aside(self, surveyed: Survey, say: Say) -> "StorePlaces":
         """The places without the build; its rows stay known unless its feature spec is another."""
         if self.begun is not None:
-            before = RowSource(self.part).said
+            before = RowSource(self.part).attributes
             if before.feature_spec.digest == surveyed.spec.digest:
                 set_build_aside(self.target)
             for line in spec_differences(before.raw["feature_spec"], surveyed.spec.attrs()):
@@ -102,7 +102,7 @@ class StorePlaces:
             known = _contents(self.previous)
             fate = "kept" if lost else "removed"
             fate = "replaced by it" if lost and self.finished else fate
-            gone = "all its" if known is None else sum(one not in contents for one in known)
+            gone = "all its" if known is None else sum(content not in contents for content in known)
             lines.append(
                 f"{self.previous} is {fate} when this run succeeds; {gone} episode(s) are only in "
                 "there"
@@ -114,7 +114,7 @@ class StorePlaces:
         keep = self._lost(surveyed) is not None
         build.seal(keep=keep)
         if keep:
-            say(f"{self.previous}: the store of before, kept until the next successful run")
+            say(f"{self.previous}: the store before, kept until the next successful run")
         elif self.kept:
             remove_folder(self.previous, KEPT)
 
@@ -162,15 +162,15 @@ class StorePlaces:
 def row_sources(places: Sequence[Path], surveyed: Survey) -> list[RowSource]:
     """The stores and laid-out builds of the same feature spec among these."""
     digest, sources = surveyed.spec.digest, map(RowSource, places)
-    return [source for source in sources if source.said.feature_spec.digest == digest]
+    return [source for source in sources if source.attributes.feature_spec.digest == digest]
 
 
 def _refuse_another(source: RowSource, surveyed: Survey, embodiment: Embodiment) -> None:
     known = {text.content for text in source.texts}
     if not known or known & surveyed.contents or not source.rows:
         return
-    there, here = source.said.sources, sorted({r.source for r in surveyed.recordings})
-    streams, now = source.said.raw["streams"], embodiment.document()
+    there, here = source.attributes.sources, sorted({r.source for r in surveyed.recordings})
+    streams, now = source.attributes.raw["streams"], embodiment.document()
     both = [name for name in now if streams[name]["names"] and now[name]["names"]]
     apart = differences({name: streams[name] for name in both}, {name: now[name] for name in both})
     differing = [f"; {line}" for line in describe(apart)]

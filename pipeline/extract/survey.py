@@ -148,7 +148,7 @@ def sound_episodes(
     again = survey(surveyed.params, digests)
     if again.action_rotation == surveyed.action_rotation:
         kept = {episode.digest for episode in again.episodes}
-        return again, [episode for episode in checked if episode.said["digest"] in kept]
+        return again, [episode for episode in checked if episode.fields["digest"] in kept]
     return sound_episodes(again, digests)
 
 

@@ -17,7 +17,7 @@ from pipeline.base.border import shown
 from pipeline.store.border import EpisodeText, store_border
 from pipeline.store.schema import POSITIONS, STREAMS
 
-SAID = tuple(name for name in EpisodeText.model_fields if name != "group")
+FIELDS = tuple(name for name in EpisodeText.model_fields if name != "group")
 """What `episode/text` says of each episode; beside it `group`, where the recording names one."""
 
 
@@ -46,7 +46,7 @@ class Episode:
     def text(self) -> bytes:
         """What `episode/text` says of it."""
         group = {} if self.group is None else {"group": self.group}
-        return _text({name: getattr(self, name) for name in SAID} | group)
+        return _text({name: getattr(self, name) for name in FIELDS} | group)
 
     @property
     def counts(self) -> dict[str, int]:
@@ -55,8 +55,8 @@ class Episode:
         return {**rows, "text": len(self.text)}
 
 
-def _text(said: Mapping[str, str]) -> bytes:
-    return json.dumps(said, ensure_ascii=False).encode()
+def _text(fields: Mapping[str, str]) -> bytes:
+    return json.dumps(fields, ensure_ascii=False).encode()
 
 
 def read_texts(root: Path, arrays: Mapping[str, NDArray[Any]]) -> list[EpisodeText]:
@@ -136,13 +136,13 @@ class EpisodeRows:
     readings: int
     states: int
     source: str
-    said: Mapping[str, str]
-    """The fields named in `SAID`, and `group` where the recording names one."""
+    fields: Mapping[str, str]
+    """The fields named in `FIELDS`, and `group` where the recording names one."""
 
     @property
     def text(self) -> bytes:
         """What is said, as JSON."""
-        return _text(self.said)
+        return _text(self.fields)
 
     @property
     def counts(self) -> dict[str, int]:

@@ -117,9 +117,7 @@ def recover(target: Path) -> None:
     _tidy(target)
     for left in sorted(target.parent.glob(f"{glob.escape(target.name)}.known-*")):
         if left.name.rpartition("-")[2].isdigit() and is_store(left):  # of earlier versions
-            for place in (part, part / KNOWN):
-                claim(place, STORE)
-            left.rename(_free(part / KNOWN))
+            left.rename(_place_aside(part))
     for moving in part.glob(f"{KNOWN}/*/{_MOVED_LAST}"):
         _move_build(part, moving.parent)
 
@@ -132,9 +130,7 @@ def begin_build(target: Path) -> None:
 def set_build_aside(target: Path) -> None:
     """Move the build into `.known` of its own part, where its rows stay known."""
     part = part_path(target)
-    for place in (part, part / KNOWN):
-        claim(place, STORE)
-    folder = _free(part / KNOWN)
+    folder = _place_aside(part)
     folder.mkdir()
     (part / "zarr.json").rename(folder / _MOVED_LAST)
     _move_build(part, folder)
@@ -177,8 +173,11 @@ def _tidy(target: Path) -> None:
         remove_folder(target / name, STORE)
 
 
-def _free(known: Path) -> Path:
-    return next(path for number in count() if not (path := known / str(number)).exists())
+def _place_aside(part: Path) -> Path:
+    """A free place in `.known`."""
+    for folder in (part, part / KNOWN):
+        claim(folder, STORE)
+    return next(path for number in count() if not (path := part / KNOWN / str(number)).exists())
 
 
 def _move_build(part: Path, folder: Path) -> None:

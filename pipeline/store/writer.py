@@ -142,7 +142,7 @@ class StoreBuild:
     def linkable(self, name: str, source_spec: ArraySpec, rows: int) -> int:
         """How many chunks lie wholly in the first `rows` rows and are cut as the other's are."""
         spec = self.specs[name]
-        cuts = {(one.chunk_rows, one.row_bytes, one.dtype) for one in (spec, source_spec)}
+        cuts = {(cut.chunk_rows, cut.row_bytes, cut.dtype) for cut in (spec, source_spec)}
         if len(cuts) > 1 or name in INCREMENTAL:
             return 0
         return min(rows // spec.chunk_rows, spec.chunk_count, source_spec.chunk_count)
@@ -245,12 +245,10 @@ class StoreBuild:
         For a build whose rows are all there. Raises `DiskFull`.
         """
         spec, files = group_attributes(self.part)["feature_spec"], self.files(KEYS)
-        given = list(rows)
-        proven = [
-            golden for golden in given if golden.key(spec) == files.read(golden.row, 1).tobytes()
-        ]
+        rows = list(rows)
+        proven = [row for row in rows if row.key(spec) == files.read(row.row, 1).tobytes()]
         write_golden(self.part, sorted(proven, key=lambda golden: golden.row))
-        return len(given) - len(proven)
+        return len(rows) - len(proven)
 
     def seal(self, *, keep: bool = False) -> None:
         """Check every row, write the trailers and put the store in its place.
