@@ -30,7 +30,7 @@ _DAMAGED = {
     sqlite3.SQLITE_FORMAT,
     sqlite3.SQLITE_NOTADB,
 }
-"""What SQLite says of a damaged ledger; of one in memory it may say anything."""
+"""SQLite's errors for a damaged ledger; for one in memory any error is taken as one."""
 _FILE = Border(RecordingError, "Copy the file again, or leave its recording out.")
 
 

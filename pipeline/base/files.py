@@ -326,7 +326,7 @@ def write_with_digest(path: Path, document: Mapping[str, Any]) -> None:
 
 
 def read_document(path: Path, model: type[T]) -> tuple[T, dict[str, Any]]:
-    """The JSON document at `path` as the model, and as it is, without the digest of itself.
+    """The JSON document at `path` as the model, and as a dictionary without its digest.
 
     Raises `CheckpointIncomplete` where it is missing, is none, or is not what its digest is of.
     """

@@ -2,7 +2,7 @@
 
 import json
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from itertools import takewhile
 from typing import Any
 
@@ -35,7 +35,7 @@ _READERS = Border(
 
 
 def check_readable(build: StoreBuild, checked: Sequence[CheckedEpisode], survey: Survey) -> None:
-    """Raise `RecordingError` where readers would refuse what the store is to say of itself."""
+    """Raise `RecordingError` where readers would refuse the attributes of the store."""
     where = build.target / "zarr.json"
     text = json.dumps(_attributes(checked, survey) | {"plan": build.plan}, indent=2)
     if len(text) > MOST_BYTES // 2:  # golden rows and environments come yet
@@ -65,30 +65,29 @@ def check_space(
 
 
 def lay_out(
-    build: StoreBuild,
-    checked: Sequence[CheckedEpisode],
-    survey: Survey,
-    known: Sequence[RowSource],
-    carry: Callable[[], object] = lambda: None,
+    build: StoreBuild, checked: Sequence[CheckedEpisode], survey: Survey, known: Sequence[RowSource]
 ) -> None:
-    """Write all but the feature rows; chunks of unchanged streams are linked from a finished store.
+    """Write streams, ticks and episodes, linking unchanged chunks of a finished store.
 
-    `carry` writes feature rows before the build counts as laid out. Raises `DiskFull`.
+    The build counts as laid out after `finish_layout`. Raises `DiskFull`.
     """
     build.create()
     for source, name, rows in _linkable(build, checked, known):
         build.link_unchanged(name, source.path, source.specs[name], rows)
     build.allocate()
-    attributes = _attributes(checked, survey)
-    sources, views = attributes["sources"], survey.spec.views
-    for name, values in episode_arrays(checked, sources, views).items():
+    sources = [source.name for source in survey.params.data.sources]
+    for name, values in episode_arrays(checked, sources, survey.spec.views).items():
         build.write(name, 0, values)
     valid = [_slot_valid(episode.ticks, survey.spec) for episode in checked]
     build.write("vl/slot_valid", 0, np.concatenate(valid))
     starts = {"sensor": 0, "state": 0}
     for episode in tqdm(checked, "streams", unit="episode", disable=None, leave=False):
         _write_streams(build, episode, starts)
-    carry()
+
+
+def finish_layout(build: StoreBuild, checked: Sequence[CheckedEpisode], survey: Survey) -> None:
+    """Write checksums and attributes, the plan last: from here on the build resumes."""
+    attributes = _attributes(checked, survey)
     build.finish_layout(attributes, {"slots": attributes["slots"]})
 
 

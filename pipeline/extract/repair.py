@@ -15,7 +15,7 @@ from pipeline.base.config import Params
 from pipeline.base.digests import ContentDigests, ledger_path
 from pipeline.base.errors import StoreMismatch
 from pipeline.base.files import disk_full_named, remove_folder
-from pipeline.extract.layout import build_arrays, check_space, lay_out
+from pipeline.extract.layout import build_arrays, check_space, finish_layout, lay_out
 from pipeline.extract.state import Say
 from pipeline.extract.survey import sound_episodes, survey
 from pipeline.store import FEATURES, StoreBuild, build_lock, part_path, read_plan, recover
@@ -128,16 +128,11 @@ def _begin_from_recordings(
         )
     with closing(StoreBuild(store, build_arrays(checked, surveyed), plan)) as build:
         check_space(build, checked, ())
-        specs, _ = read_arrays(store)
-        carried = 0
-
-        def carry() -> None:
-            nonlocal carried
-            shapes = {name: spec.shape for name, spec in specs.items()}
-            if all(shapes.get(name) == build.specs[name].shape for name in INCREMENTAL):
-                carried = _carry_rows(verification, build)
-
-        lay_out(build, checked, surveyed, (), carry)
+        lay_out(build, checked, surveyed, ())
+        shapes = {name: spec.shape for name, spec in read_arrays(store)[0].items()}
+        readable = all(shapes.get(name) == build.specs[name].shape for name in INCREMENTAL)
+        carried = _carry_rows(verification, build) if readable else 0
+        finish_layout(build, checked, surveyed)
     return build.specs[FEATURES].shape[0], carried
 
 

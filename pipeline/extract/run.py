@@ -12,7 +12,13 @@ from pipeline.base.format import capped
 from pipeline.data.timeline import rate_notes
 from pipeline.extract.engine import ExtractionReport, fill
 from pipeline.extract.golden import keep_golden
-from pipeline.extract.layout import build_arrays, check_readable, check_space, lay_out
+from pipeline.extract.layout import (
+    build_arrays,
+    check_readable,
+    check_space,
+    finish_layout,
+    lay_out,
+)
 from pipeline.extract.plan import count_known, plan_lines
 from pipeline.extract.state import Say, StorePlaces, row_sources
 from pipeline.extract.survey import (
@@ -79,6 +85,7 @@ def extract(params: Params, say: Say) -> ExtractionReport | None:
                 # Nothing can refuse the run any more.
                 places = places.set_build_aside(surveyed, say)
                 lay_out(build, checked, surveyed, row_sources(places.known, surveyed))
+                finish_layout(build, checked, surveyed)
             known = row_sources(places.known, surveyed)
             report = fill(build, surveyed, known, digests, build.missing())
             keep_golden(build, surveyed, places, say)

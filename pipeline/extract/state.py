@@ -128,7 +128,7 @@ class StorePlaces:
         if not self.stores or read_plan(self.stores[0]) == surveyed.plan:
             return None
         if (known := _contents(self.stores[0])) is None:
-            return "episodes that can no longer be told"
+            return "episodes that cannot be read any more"
         contents = surveyed.contents
         lost = sum(content not in contents for content in known)
         what = f"{lost} episode(s) that are not in this run (or whose files are read otherwise now)"

@@ -18,7 +18,7 @@ from pipeline.store.border import EpisodeText, store_border
 from pipeline.store.schema import POSITIONS, STREAMS
 
 FIELDS = tuple(name for name in EpisodeText.model_fields if name != "group")
-"""What `episode/text` says of each episode; beside it `group`, where the recording names one."""
+"""The entries of an episode in `episode/text`; `group` stands there too where it is known."""
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ class Episode:
 
     @property
     def text(self) -> bytes:
-        """What `episode/text` says of it."""
+        """Its JSON object in `episode/text`."""
         group = {} if self.group is None else {"group": self.group}
         return _text({name: getattr(self, name) for name in FIELDS} | group)
 
@@ -60,7 +60,7 @@ def _text(fields: Mapping[str, str]) -> bytes:
 
 
 def read_texts(root: Path, arrays: Mapping[str, NDArray[Any]]) -> list[EpisodeText]:
-    """What `episode/text` says of each episode.
+    """The texts of all episodes, in order.
 
     Raises `StoreIncomplete` naming the episode whose text is broken.
     """
@@ -128,7 +128,7 @@ def read_episodes(
 
 @dataclass(frozen=True)
 class EpisodeRows:
-    """How many rows of each stream an episode has, and what is said of it."""
+    """How many rows of each stream an episode has, and its entries in `episode/text`."""
 
     ticks: Any
     """A `pipeline.data.timeline.Timeline`, or what says the same: ticks with indices into the
@@ -141,7 +141,7 @@ class EpisodeRows:
 
     @property
     def text(self) -> bytes:
-        """What is said, as JSON."""
+        """Its JSON object in `episode/text`."""
         return _text(self.fields)
 
     @property

@@ -2,7 +2,7 @@
 
     <name>.zarr            the finished store, never modified
     <name>.zarr.part       the build; `.known/<n>` in it are interrupted builds of other plans
-    <name>.zarr.previous   the store before, kept (and marked) for episodes that the new one lacks
+    <name>.zarr.previous   the replaced store, kept and marked, where it has more episodes
 
 Whoever changes one of them holds `<name>.zarr.lock` and calls `recover` first. A part goes through
 these states; rows are known from the store, the previous one, a part with a plan and its `.known`:
@@ -76,7 +76,7 @@ def part_path(target: Path) -> Path:
 
 
 def previous_path(target: Path) -> Path:
-    """Where the store before is kept."""
+    """Where the store that was replaced is kept."""
     return target.with_name(target.name + ".previous")
 
 
@@ -88,7 +88,7 @@ def is_store(path: Path) -> bool:
 
 STORE = OutputKind("a feature store", is_store)
 KEPT = OutputKind("a store of before, kept for its rows,", is_aside_link)
-"""The previous store, by its marker: a copy or a link that a user made there is none."""
+"""The previous store, by its marker, whose line earlier versions wrote: a user's copy is none."""
 
 
 def refuse_foreign_store(target: Path) -> None:
