@@ -180,67 +180,41 @@ def replace_folder(folder: Path, write: Callable[[Path], None], kind: OutputKind
 
 def recover_folder(folder: Path, kind: OutputKind) -> None:
     """Undo or complete a `replace_folder` that a kill stopped."""
-    recover(folder, kind)
-    remove_folder(_beside(folder, "new"), kind)
+    temporary = _beside(folder, "new")
+    recover(temporary, folder, kind)
+    remove_folder(temporary, kind)
 
 
 def put_in_place(complete: Path, target: Path, kind: OutputKind) -> None:
     """Rename a complete folder to `target` and remove what was there; of a link, the link alone.
 
-    A kill leaves the old one or the new: the old one lies in `<target>.replaced` meanwhile, from
-    where `recover` brings it back. Raises `ConfigError` where something that is not this project's
-    lies in one of these places.
+    A kill leaves the old one or the new: the old one moves into the complete folder, from where
+    `recover` brings it back. Raises `ConfigError` where the old one is not of this kind.
     """
-    recover(target, kind)
+    refuse_foreign(target, kind)
     unmark(complete)
     if there(target):
-        set_aside(target, _beside(target, "replaced"), HELD)
+        target.rename(complete / _REPLACED)
     complete.rename(target)
     sync(target.parent)
-    recover(target, kind)
+    recover(complete, target, kind)
 
 
-def recover(target: Path, kind: OutputKind) -> None:
+def recover(complete: Path, target: Path, kind: OutputKind) -> None:
     """Undo or complete a `put_in_place` that a kill stopped.
 
-    Raises `ConfigError` where something that is not this project's lies in one of its places.
+    Raises `ConfigError` where what lies at `target` is not of this kind.
     """
-    if HELD.marks(target):
-        unmark(target)
     refuse_foreign(target, kind)
-    held = old = _beside(target, "replaced")
-    refuse_foreign(held, HELD)
-    if held.is_dir() and {path.name for path in held.iterdir()} == {MARKER, target.name}:
-        old = held / target.name  # earlier versions put the old folder into a marked one
-    if there(old) and not there(target):
-        old.rename(target)
-        if HELD.marks(target):
-            unmark(target)
-    remove_folder(held, HELD)
-
-
-def set_aside(folder: Path, aside: Path, kind: OutputKind) -> None:
-    """Rename a folder to `aside`, marked as of this kind, in place of an older one of the kind.
-
-    Of a symbolic link the folder behind it stays as it is; `aside` is a link to it.
-    """
-    remove_folder(aside, kind)
-    if folder.is_symlink():
-        aside.symlink_to(os.path.realpath(folder) + _LINK_ENDS)
-        folder.unlink()
-    else:
-        mark(folder, kind)
-        folder.rename(aside)
-
-
-_LINK_ENDS = "/."
-"""How the links of `set_aside` end: nothing is written into the folder behind one."""
-
-
-def is_aside_link(path: Path) -> bool:
-    """Whether `set_aside` made this link."""
-    # A Path would leave the end out.
-    return path.is_symlink() and os.readlink(path).endswith(_LINK_ENDS)  # noqa: PTH115
+    if there(complete / _REPLACED) and not there(target):
+        (complete / _REPLACED).rename(target)
+    if HELD.marks(earlier := _beside(target, "replaced")):
+        if there(earlier / target.name) and not there(target):
+            (earlier / target.name).rename(target)
+        remove_folder(earlier, HELD)
+    if (target / _REPLACED).is_symlink():
+        (target / _REPLACED).unlink()
+    remove_folder(target / _REPLACED, kind)
 
 
 REPORT = OutputKind(
@@ -248,8 +222,9 @@ REPORT = OutputKind(
     advice=f" (Reports of earlier versions hold no {MARKER}: move or remove these.)",
 )
 """What evaluations, inspections, probes, comparisons and trainings show; it keeps its marker."""
-HELD = OutputKind("a folder that is being replaced,", is_aside_link)
-"""Where `put_in_place` has the old folder meanwhile."""
+HELD = OutputKind("a folder that is being replaced,")
+"""What earlier versions put the old folder into, as `<name>.replaced`."""
+_REPLACED = ".replaced"
 
 
 def _is_empty(folder: Path) -> bool:

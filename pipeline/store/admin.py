@@ -30,7 +30,6 @@ from pipeline.store.lock import build_lock, lock_holder
 from pipeline.store.paths import (
     KEPT,
     MERGED,
-    REPLACED,
     STORE,
     builds_aside,
     laid_out_attributes,
@@ -221,7 +220,7 @@ def remove_leftover(leftover: Leftover) -> None:
     try:
         with build_lock(base):
             # Looked at again under the lock: a killed replacement leaves the only copy there.
-            held = _KINDS.get(path.suffix) == "replaced" or (path / REPLACED).exists()
+            held = _KINDS.get(path.suffix) == "replaced" or (path / ".replaced").exists()
             only_copy = held and not base.exists()
             if path.is_symlink() or only_copy:
                 return
@@ -362,8 +361,8 @@ def _fate(inventory: Inventory, entry: StoreEntry) -> tuple[Fate, str]:
     sound = {other.kind for other in beside if other.damage is None}
     if entry.kind == "replaced" and not sound & {"store", "archive"}:
         return "kept", (
-            f"the only copy of {entry.base.name}, set aside by a replacement that was killed; "
-            "stages.extract says where to move it"
+            f"the only copy of {entry.base.name}, set aside by a replacement that was killed; the "
+            "next stages.extract puts it back"
         )
     if entry.kind == "ledger" and any(other.kind not in ("lock", "ledger") for other in beside):
         return "in place", "content digests for a store that is there"

@@ -24,10 +24,12 @@ A kill leaves:
 """
 
 import glob
+import os
 from itertools import count
 from pathlib import Path
 from typing import Any
 
+from pipeline.base import files
 from pipeline.base.border import Border, shown
 from pipeline.base.errors import ConfigError, StoreIncomplete, StoreMismatch
 from pipeline.base.files import (
@@ -36,11 +38,9 @@ from pipeline.base.files import (
     begin_folder,
     claim,
     described,
-    is_aside_link,
+    mark,
     refuse_foreign,
     remove_folder,
-    set_aside,
-    sync,
     there,
     unmark,
 )
@@ -57,12 +57,10 @@ from pipeline.store.schema import SCHEMA
 MERGED = "merge-"
 """How the plan of a store begins that was not extracted but merged."""
 
-REPLACED = ".replaced"
 _MOVED_LAST = ".zarr.json"
 """What `set_build_aside` calls the metadata of a build until the rest of it has moved."""
 _EARLIER = {
     "repair.part": "a repair that was stopped: remove it",
-    "replaced": "a store while it replaced it: if there is no {0}, move {1} there; remove the rest",
     "keeping": "a store while it replaced it: if there is no {0}, move {1} there; remove the rest",
 }
 """What versions before this one left beside a store when they were killed, and what to do."""
@@ -87,7 +85,16 @@ def is_store(path: Path) -> bool:
 
 
 STORE = OutputKind("a feature store", is_store)
-KEPT = OutputKind("a store of before, kept for its rows,", is_aside_link)
+_LINK_ENDS = "/."
+"""How a link ends that was kept: nothing is written into the folder behind it."""
+
+
+def _is_kept_link(path: Path) -> bool:
+    # A Path would leave the end out.
+    return path.is_symlink() and os.readlink(path).endswith(_LINK_ENDS)  # noqa: PTH115
+
+
+KEPT = OutputKind("a store of before, kept for its rows,", _is_kept_link)
 """The previous store, by its marker, whose line earlier versions wrote: a user's copy is none."""
 
 
@@ -112,9 +119,8 @@ def recover(target: Path) -> None:
             raise ConfigError(f"{left}: an earlier version left {todo}. Then run this again.")
     if KEPT.marks(target):
         unmark(target)
-    if not there(target) and there(part / REPLACED):
-        (part / REPLACED).rename(target)
-    _tidy(target)
+    files.recover(part, target, STORE)
+    remove_folder(target / KNOWN, STORE)
     for left in sorted(target.parent.glob(f"{glob.escape(target.name)}.known-*")):
         if left.name.rpartition("-")[2].isdigit() and is_store(left):  # of earlier versions
             left.rename(_place_aside(part))
@@ -150,27 +156,20 @@ def unfinished_plans(target: Path) -> list[str]:
 def put_in_place(target: Path, keep: bool = False) -> None:
     """Rename a sealed part to the store; remove what was there, or `keep` it as the previous one.
 
-    Of a store behind a symbolic link the link alone goes. Raises `ConfigError` where something that
-    is not this project's lies in one of the places.
+    Of a store behind a symbolic link the link alone goes; one that is kept is a link to the same
+    folder. Raises `ConfigError` where something that is not this project's lies in a place.
     """
-    part = part_path(target)
-    refuse_foreign(target, STORE)
-    unmark(part)
+    previous = previous_path(target)
     if keep and there(target):
-        set_aside(target, previous_path(target), KEPT)
-    elif target.is_symlink():
-        target.unlink()
-    elif target.exists():
-        target.rename(part / REPLACED)
-    part.rename(target)
-    sync(target.parent)
-    _tidy(target)
-
-
-def _tidy(target: Path) -> None:
-    """Remove from a store what came with it from its part."""
-    for name in (KNOWN, REPLACED):
-        remove_folder(target / name, STORE)
+        remove_folder(previous, KEPT)
+        if target.is_symlink():
+            previous.symlink_to(os.path.realpath(target) + _LINK_ENDS)
+            target.unlink()
+        else:
+            mark(target, KEPT)
+            target.rename(previous)
+    files.put_in_place(part_path(target), target, STORE)
+    remove_folder(target / KNOWN, STORE)
 
 
 def _place_aside(part: Path) -> Path:

@@ -156,7 +156,7 @@ def open_run(
     output, identity = params.output, run_identity(params, store, extra_identity)
     part = _part(output)
     notes = []
-    recover(output, RUN_FOLDER)
+    recover(part, output, RUN_FOLDER)
     if (output / RUN).exists():
         another = read_document(output / RUN, RunDocument)[1] != identity
         if another or params.anew:

@@ -24,7 +24,6 @@ WRITERS: dict[str, tuple[str, str, tuple[str, ...]]] = {
         "x.zarr.files.sqlite",
         ("extract.store={tmp}/x.zarr", "extract.plan=true"),
     ),
-    "replaced": ("stages.extract", "stores/made.zarr.replaced", ()),
     "lost": (
         "stages.extract",
         "stores/made.zarr.previous",
