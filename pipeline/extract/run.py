@@ -5,6 +5,8 @@ from collections.abc import Generator, Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
 
+import numpy as np
+
 from pipeline.base.config import Params
 from pipeline.base.device import resolve_device
 from pipeline.base.digests import ContentDigests, ledger_path
@@ -64,9 +66,10 @@ def extract(params: Params, say: Say) -> ExtractionReport | None:
             build = StoreBuild(target, build_arrays(checked, surveyed), surveyed.plan)
         with closing(build):
             rows = build.specs[FEATURES].shape[0]
+            missing = build.missing() if state == "resume" else np.arange(rows)
             if state == "resume":
                 known = [RowSource(places.part)]
-                taken = rows - len(build.missing())
+                taken = rows - len(missing)
             else:
                 check_readable(build, checked, surveyed)
                 begun = [] if places.begun is None else [places.part]
@@ -87,7 +90,7 @@ def extract(params: Params, say: Say) -> ExtractionReport | None:
                 lay_out(build, checked, surveyed, row_sources(places.known, surveyed))
                 finish_layout(build, checked, surveyed)
             known = row_sources(places.known, surveyed)
-            report = fill(build, surveyed, known, digests, build.missing())
+            report = fill(build, surveyed, known, digests, missing)
             keep_golden(build, surveyed, places, say)
             places.put_in_place(build, surveyed, say)
         return report

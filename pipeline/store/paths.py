@@ -59,12 +59,6 @@ MERGED = "merge-"
 
 _MOVED_LAST = ".zarr.json"
 """What `set_build_aside` calls the metadata of a build until the rest of it has moved."""
-_EARLIER = {
-    "repair.part": "a repair that was stopped: remove it",
-    "keeping": "a store while it replaced it: if there is no {0}, move {1} there; remove the rest",
-}
-"""What versions before this one left beside a store when they were killed, and what to do."""
-
 Inode = tuple[int, int]
 
 
@@ -112,11 +106,12 @@ def recover(target: Path) -> None:
     """
     refuse_foreign_store(target)
     part = part_path(target)
-    for suffix, what in _EARLIER.items():
-        left = target.with_name(f"{target.name}.{suffix}")
-        if there(left):
-            todo = what.format(target, left / target.name)
-            raise ConfigError(f"{left}: an earlier version left {todo}. Then run this again.")
+    for suffix in ("repair.part", "keeping"):
+        if there(left := target.with_name(f"{target.name}.{suffix}")):
+            raise ConfigError(
+                f"{left}: an earlier version left it when it was stopped. If there is no {target} "
+                f"and a {left / target.name}, move that there. Remove {left} and run this again."
+            )
     if KEPT.marks(target):
         unmark(target)
     files.recover(part, target, STORE)

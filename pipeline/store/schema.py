@@ -300,17 +300,14 @@ def rows_of(specs: Mapping[str, ArraySpec]) -> dict[str, int]:
 
 
 def check_agreement(
-    root: Path,
-    attributes: StoreAttributes,
-    specs: Mapping[str, ArraySpec],
-    border: Border | None = None,
+    root: Path, attrs: StoreAttributes, specs: Mapping[str, ArraySpec], border: Border | None = None
 ) -> None:
     """Raise `StoreIncomplete` where the arrays of a store do not fit each other, or its attributes
     say other widths than they have."""
     border = border or store_border(root)
     for name, what in disagreements(specs):
         raise border.refusal(root / name / "zarr.json", what)
-    streams, spec = attributes.streams, attributes.feature_spec
+    streams, spec = attrs.streams, attrs.feature_spec
     pairs = {
         "streams.action.names": (streams.action.names, specs["tick/action"].shape[1]),
         "streams.action.units": (streams.action.units, specs["tick/action"].shape[1]),
@@ -325,6 +322,6 @@ def check_agreement(
     if len(spec.slots) % spec.variants:
         wrong.append(f"feature_spec.variants: expected a divisor of {len(spec.slots)} slots")
     rows = specs[FEATURES].shape[0]
-    wrong += [f"golden: row {row.row} of {rows}" for row in attributes.golden if row.row >= rows]
+    wrong += [f"golden: row {row.row} of {rows}" for row in attrs.golden if row.row >= rows]
     if wrong:
         raise border.refusal(root / "zarr.json", "; ".join(wrong))
