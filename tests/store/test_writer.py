@@ -73,8 +73,15 @@ class Killed(BaseException):
     """Stands for SIGKILL: nothing may catch it."""
 
 
-def killed_before(step: int, act: Callable[[], None]) -> bool:
-    """Whether `act` was killed before its n-th change of a folder."""
+CHANGES = (
+    *((Path, name) for name in ("rename", "mkdir", "write_text", "unlink", "symlink_to")),
+    (shutil, "rmtree"),
+)
+"""Of a folder."""
+
+
+def killed_before(step: int, act: Callable[[], None], steps=CHANGES) -> bool:
+    """Whether `act` was killed before its n-th of these steps."""
     count = iter(range(10**6))
 
     def counted(real):
@@ -86,9 +93,8 @@ def killed_before(step: int, act: Callable[[], None]) -> bool:
         return call
 
     with pytest.MonkeyPatch.context() as patch:
-        for name in ("rename", "mkdir", "write_text", "unlink", "symlink_to"):
-            patch.setattr(Path, name, counted(getattr(Path, name)))
-        patch.setattr(shutil, "rmtree", counted(shutil.rmtree))
+        for owner, name in steps:
+            patch.setattr(owner, name, counted(getattr(owner, name)))
         try:
             act()
         except Killed:
@@ -200,7 +206,7 @@ class TestSeal:
             if replaces:
                 self.full(folder, "before", seed=1).seal()
             build = self.full(folder, "after")
-            finished = self._sealed_before_kill(build, steps, kill_at)
+            finished = not killed_before(kill_at, build.seal, steps)
             if not finished:
                 recover(build.target)
                 if build.part.exists():
@@ -213,26 +219,6 @@ class TestSeal:
                 assert kill_at >= 4
                 return
         raise AssertionError("sealing takes more steps than expected")
-
-    def _sealed_before_kill(self, build: StoreBuild, steps, kill_at: int) -> bool:
-        count = iter(range(10**6))
-
-        def counted(real):
-            def call(*args, **kwargs):
-                if next(count) == kill_at:
-                    raise Killed
-                return real(*args, **kwargs)
-
-            return call
-
-        with pytest.MonkeyPatch.context() as patch:
-            for owner, name in steps:
-                patch.setattr(owner, name, counted(getattr(owner, name)))
-            try:
-                build.seal()
-            except Killed:
-                return False
-        return True
 
     @pytest.mark.parametrize("linked", [False, True])
     def test_a_kill_while_the_old_is_kept_is_mended_by_sealing_again(self, tmp_path, linked):
