@@ -19,8 +19,15 @@ if __name__ == "__main__":  # here, for --help waits for no import below
     raise SystemExit(run(__doc__ or "", "stages.compare", sections=("compare",)))
 
 from pipeline.base.config import Params
-from pipeline.base.durable import disk_full_named, fresh
-from pipeline.base.ownership import REPORT, OutputKind, begins_with, claim, refuse_foreign
+from pipeline.base.files import (
+    REPORT,
+    OutputKind,
+    begins_with,
+    claim,
+    disk_full_named,
+    fresh,
+    refuse_foreign,
+)
 from pipeline.evaluate.experiments import (
     SPANS,
     best_experiment,

@@ -19,7 +19,7 @@ if __name__ == "__main__":  # here, for --help waits for no import below
 from pathlib import Path
 
 from pipeline.base.config import Params
-from pipeline.base.durable import recover_folder, replace_folder, write_document
+from pipeline.base.files import recover_folder, replace_folder, write_document
 from pipeline.simulation.demo_recordings import (
     DEMO,
     MARKER,

@@ -18,8 +18,7 @@ from pathlib import Path
 
 from pipeline.base.config import Params
 from pipeline.base.device import resolve_device
-from pipeline.base.durable import write_document
-from pipeline.base.ownership import REPORT, claim, refuse_foreign
+from pipeline.base.files import REPORT, claim, refuse_foreign, write_document
 from pipeline.evaluate.evaluation import JUDGED, Evaluation, evaluate_checkpoint
 from pipeline.evaluate.tables import ablation_text, error_text, write_tables
 from pipeline.look.evaluation import evaluation_report

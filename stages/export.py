@@ -17,7 +17,7 @@ if __name__ == "__main__":  # here, for --help waits for no import below
 from functools import partial
 
 from pipeline.base.config import Params
-from pipeline.base.ownership import refuse_foreign
+from pipeline.base.files import refuse_foreign
 from pipeline.policy.checkpoint import find_policy, load_policy
 from pipeline.robot.export import EXPORT, RECEIPT, export_head
 

@@ -30,7 +30,7 @@ if __name__ == "__main__":  # here, for --help waits for no import below
 from collections.abc import Iterator
 
 from pipeline.base.config import Params
-from pipeline.base.ownership import REPORT, claim
+from pipeline.base.files import REPORT, claim
 from pipeline.look.page.blocks import Issues, Report
 from pipeline.look.page.issues import FINDINGS, group_issues, place_of, places_of
 from pipeline.look.page.style import boxes
@@ -47,7 +47,8 @@ def main(params: Params) -> None:
     """Write the page of what `inspect.path` names."""
     subject = subject_of(params)
     report = _report(subject, params)
-    claim(subject.folder, REPORT)
+    for folder in (params.inspect.output, subject.folder):
+        claim(folder, REPORT)
     with boxes() as notes:
         page, *beside = write_report(subject.folder, report)
     print("\n".join([*summary(report), *notes]))

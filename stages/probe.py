@@ -22,7 +22,7 @@ if __name__ == "__main__":  # here, for --help waits for no import below
     raise SystemExit(run(__doc__ or "", "stages.probe", sections=("probe",)))
 
 from pipeline.base.config import Params
-from pipeline.base.ownership import REPORT, claim, refuse_foreign, release
+from pipeline.base.files import REPORT, claim, refuse_foreign
 from pipeline.evaluate.probe.study import probe
 from pipeline.evaluate.probe.tables import advice, table, write_tables
 from pipeline.look.page.style import write
@@ -45,7 +45,6 @@ def main(params: Params) -> None:
         *write_tables(wanted.output, study),
         *write(wanted.output, {"probe.png": lambda: draw_gains(study)}),
     ]
-    release(wanted.output, REPORT)
     print(table(study))
     print(advice(study))
     print(f"{wanted.output}: {', '.join(file.name for file in files)}")

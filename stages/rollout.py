@@ -24,8 +24,7 @@ from pathlib import Path
 
 from pipeline.base.config import Params, RolloutParams
 from pipeline.base.device import resolve_device
-from pipeline.base.durable import write_document
-from pipeline.base.ownership import REPORT, claim, refuse_foreign
+from pipeline.base.files import REPORT, claim, refuse_foreign, write_document
 from pipeline.evaluate.rollout_driver import roll_out, roll_out_served
 from pipeline.evaluate.rollouts import Rollouts
 from pipeline.look.page.blocks import Report

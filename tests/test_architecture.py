@@ -179,4 +179,4 @@ def test_the_pictures_rooms_exist():
 def test_only_one_module_removes_folders(module):
     """It refuses those that are not this project's."""
     text = MODULES[module].read_text(encoding="utf-8")
-    assert module == "pipeline.base.ownership" or "rmtree" not in text
+    assert module == "pipeline.base.files" or "rmtree" not in text

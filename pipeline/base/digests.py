@@ -16,8 +16,10 @@ from urllib.parse import quote
 
 from pipeline.base.border import Border
 from pipeline.base.errors import ConfigError, DiskFull, PipelineError, RecordingError, StoreLocked
-from pipeline.base.ownership import LEDGER_SUFFIX, described
+from pipeline.base.files import described
 
+LEDGER_SUFFIX = ".files.sqlite"
+"""How the name of a store's ledger of file digests ends."""
 _APPLICATION = 0x564C4146
 """SQLite's `application_id` of a ledger, in its header at bytes 68 to 71, big-endian."""
 
@@ -28,7 +30,7 @@ _DAMAGED = {
     sqlite3.SQLITE_FORMAT,
     sqlite3.SQLITE_NOTADB,
 }
-"""What SQLite says of a damaged ledger; of one in memory it may say anything."""
+"""SQLite's errors for a damaged ledger; for one in memory any error is taken as one."""
 _FILE = Border(RecordingError, "Copy the file again, or leave its recording out.")
 
 

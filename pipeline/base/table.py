@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from pipeline.base.durable import disk_full_named, fresh
+from pipeline.base.files import disk_full_named, fresh
 
 NOTHING = "–"
 """Stands for a missing value."""

@@ -7,8 +7,8 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import Field, Strict, model_validator
 
 from pipeline.base.border import Border, Document, Text
-from pipeline.base.durable import read_document, write_with_digest
 from pipeline.base.errors import StoreIncomplete
+from pipeline.base.files import read_document, write_with_digest
 
 TUNED_ON = "tuned_on.json"
 """The file in the folder of an adapter or of a tuned checkpoint; no part of its digest."""

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.base.channels import named
-from pipeline.base.durable import write_document
+from pipeline.base.files import write_document
 from pipeline.base.table import Table
 from pipeline.evaluate.ablation import AblationStudy
 from pipeline.evaluate.baselines import METHODS

@@ -7,8 +7,8 @@ from numpy.typing import NDArray
 
 from pipeline.base.golden import spread
 from pipeline.data.row_range import RowFrames
-from pipeline.extract.plan import Say, StorePlaces
 from pipeline.extract.rows import row_frames
+from pipeline.extract.state import Say, StorePlaces
 from pipeline.extract.survey import Survey
 from pipeline.store import GoldenFrames, StoreBuild
 from pipeline.store.golden import carried_golden
@@ -43,9 +43,8 @@ def _carried(build: StoreBuild, surveyed: Survey, places: StorePlaces) -> dict[i
     Of a store under repair, too: damaged frames do not give their key and are left out.
     """
     keys = build.files(KEYS).read(0, build.specs[KEYS].shape[0])
-    stores = [] if places.finished is None else [places.target]
     carried: dict[int, GoldenFrames] = {}
-    for store in [*stores, *places.kept]:
+    for store in places.stores:
         for golden in carried_golden(store, surveyed.spec.attrs(), keys):
             carried.setdefault(golden.row, golden)
     return carried

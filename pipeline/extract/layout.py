@@ -12,8 +12,8 @@ from tqdm import tqdm
 
 from pipeline.base.arrays import first_non_finite
 from pipeline.base.border import MOST_BYTES, Border
-from pipeline.base.durable import free_bytes
 from pipeline.base.errors import DiskFull, NumericsError, RecordingError
+from pipeline.base.files import free_bytes
 from pipeline.base.format import size
 from pipeline.base.tuned_on import store_attributes
 from pipeline.data import Stream
@@ -35,14 +35,13 @@ _READERS = Border(
 
 
 def check_readable(build: StoreBuild, checked: Sequence[CheckedEpisode], survey: Survey) -> None:
-    """Raise `RecordingError` where readers would refuse what the store is to say of itself."""
+    """Raise `RecordingError` where readers would refuse the attributes of the store."""
     where = build.target / "zarr.json"
     text = json.dumps(_attributes(checked, survey) | {"plan": build.plan}, indent=2)
     if len(text) > MOST_BYTES // 2:  # golden rows and environments come yet
         why = f"expected attributes of at most {MOST_BYTES // 2:,} bytes, found {len(text):,}"
         raise _READERS.refusal(where, why)
-    said = _READERS.parse_json(text, dict[str, Any], where)
-    StoreAttributes.of(build.target, said, _READERS)
+    StoreAttributes.of(build.target, _READERS.parse_json(text, dict[str, Any], where), _READERS)
     for name, spec in build.specs.items():
         array_of(spec.document, name, build.target / name / "zarr.json", _READERS)
 
@@ -68,23 +67,27 @@ def check_space(
 def lay_out(
     build: StoreBuild, checked: Sequence[CheckedEpisode], survey: Survey, known: Sequence[RowSource]
 ) -> None:
-    """Write all but the feature rows; chunks of unchanged streams are linked from a finished store.
+    """Write streams, ticks and episodes, linking unchanged chunks of a finished store.
 
-    Raises `DiskFull` where the disk fills up.
+    The build counts as laid out after `finish_layout`. Raises `DiskFull`.
     """
     build.create()
     for source, name, rows in _linkable(build, checked, known):
         build.link_unchanged(name, source.path, source.specs[name], rows)
     build.allocate()
-    attributes = _attributes(checked, survey)
-    sources, views = attributes["sources"], survey.spec.views
-    for name, values in episode_arrays(checked, sources, views).items():
+    sources = [source.name for source in survey.params.data.sources]
+    for name, values in episode_arrays(checked, sources, survey.spec.views).items():
         build.write(name, 0, values)
     valid = [_slot_valid(episode.ticks, survey.spec) for episode in checked]
     build.write("vl/slot_valid", 0, np.concatenate(valid))
     starts = {"sensor": 0, "state": 0}
     for episode in tqdm(checked, "streams", unit="episode", disable=None, leave=False):
         _write_streams(build, episode, starts)
+
+
+def finish_layout(build: StoreBuild, checked: Sequence[CheckedEpisode], survey: Survey) -> None:
+    """Write checksums and attributes, the plan last: from here on the build resumes."""
+    attributes = _attributes(checked, survey)
     build.finish_layout(attributes, {"slots": attributes["slots"]})
 
 
@@ -121,7 +124,7 @@ def _linkable(
     for source in known:
         if source.path == build.target:
             pairs = zip(source.texts, checked, strict=False)
-            same = [*takewhile(lambda pair: pair[0].content == pair[1].said["content"], pairs)]
+            same = [*takewhile(lambda pair: pair[0].content == pair[1].fields["content"], pairs)]
             for stream in ("sensor", "state"):
                 rows = sum(episode.counts[stream] for _, episode in same)
                 yield source, f"{stream}/values", rows
@@ -170,7 +173,7 @@ def _attributes(checked: Sequence[CheckedEpisode], survey: Survey) -> dict[str, 
         "slots": survey.spec.document["slots"],
         "sources": [source.name for source in data.sources],
         "streams": embodiment_of(checked).document() | {"views": list(survey.spec.views)},
-        "action_hz": tick_hz((one.ticks.recorded_hz for one in checked), data.action_hz),
+        "action_hz": tick_hz((episode.ticks.recorded_hz for episode in checked), data.action_hz),
         "vlm_reuse_count": data.vlm_reuse_count,
         "environment": [],
         **store_attributes(tuned_on(survey.params.vlm)),

@@ -1,207 +1,17 @@
-"""What an extraction will do, and why, told before anything is done.
+"""What an extraction would do, and why; said before anything is done."""
 
-`StorePlaces` is what lies at the place of a store and beside it, and what of that may be used.
-"""
-
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import closing
-from functools import cached_property
-from itertools import count
-from pathlib import Path
-from typing import Any
+from collections.abc import Iterator, Sequence
 
 from pipeline.base.config import setting
-from pipeline.base.differences import describe, differences
 from pipeline.base.digests import ContentDigests
-from pipeline.base.durable import KEPT, free_bytes, previous_path
-from pipeline.base.errors import StoreIncomplete, StoreMismatch
+from pipeline.base.files import free_bytes
 from pipeline.base.format import duration, size
-from pipeline.base.ownership import refuse_foreign, remove_folder
-from pipeline.data.episode import Embodiment
+from pipeline.extract.state import BuildState, StorePlaces, spec_differences
 from pipeline.extract.survey import CheckedEpisode, Survey
-from pipeline.store import FEATURES, RowSource, StoreBuild, part_path, read_plan
-from pipeline.store.paths import MERGED, STORE, is_store
-from pipeline.store.schema import ArraySpec, read_specs
+from pipeline.store import FEATURES, RowSource, StoreBuild, read_plan
+from pipeline.store.schema import ArraySpec
 
-Say = Callable[[str], None]
-
-# Entries of a feature spec that a message lists.
-_SHOWN = 6
-
-
-class StorePlaces:
-    """A store, its unfinished build and what earlier runs left of it; plans as they were found.
-
-    `begun` and `finished` are the plans of the build and of the store, None where there is none.
-    `aside` are builds of other plans that were interrupted, kept for their rows, and `kept` is the
-    store that a run kept, if there is one: a copy that a user made is not one.
-    """
-
-    def __init__(self, target: Path) -> None:
-        self.target, self.part, self.previous = target, part_path(target), previous_path(target)
-        self.begun, self.finished = read_plan(self.part), read_plan(target)
-        self.aside = [
-            path
-            for path in sorted(target.parent.glob(f"{target.name}.known-*"))
-            if path.name.rpartition("-")[2].isdigit() and is_store(path)
-        ]
-        is_kept = KEPT.owns(self.previous) and read_plan(self.previous) is not None
-        self.kept = [self.previous] if is_kept else []
-
-    @property
-    def known(self) -> list[Path]:
-        """Builds that were set aside, the store, and the one before it, unless a repair has begun.
-
-        A repair leaves out what is damaged: that must not come back from the store that it mends.
-        """
-        store = [] if self.finished is None else [self.target]
-        return self.aside if self.repaired else [*self.aside, *store, *self.kept]
-
-    @property
-    def repaired(self) -> bool:
-        """Whether a build of the store's own plan has begun."""
-        repairs = {self.begun, *(read_plan(place) for place in self.aside)}
-        return self.finished is not None and self.finished in repairs
-
-    def stands(self, surveyed: Survey) -> bool:
-        """Whether a store or a build of this very plan is there; a build, as it was laid out."""
-        if self.begun == surveyed.plan:
-            return self.layout_damage is None
-        return self.finished == surveyed.plan
-
-    def begun_build(self) -> StoreBuild:
-        """The unfinished build."""
-        return StoreBuild(self.target, read_specs(self.part), self.begun or "")
-
-    @cached_property
-    def layout_damage(self) -> str | None:
-        """What is wrong with all but the feature rows of the unfinished build."""
-        with closing(self.begun_build()) as build:
-            return build.layout_damage()
-
-    def make_room(self, surveyed: Survey, say: Say) -> None:
-        """Set an unfinished build aside; of another feature spec, it is of no use."""
-        if self.begun is None:
-            return
-        before = RowSource(self.part).said
-        if before.feature_spec.digest != surveyed.spec.digest:
-            for line in spec_differences(before.raw["feature_spec"], surveyed.spec.attrs()):
-                say(f"the unfinished build {self.part} is given up: {line}")
-            return
-        names = (self.target.with_name(f"{self.target.name}.known-{n}") for n in count())
-        self.part.rename(next(path for path in names if not path.exists()))
-
-    def keeping_note(self, surveyed: Survey) -> list[str]:
-        """What a run says of episodes that it does not name: the store with them is kept once more.
-
-        Raises `ConfigError` where something else lies where it would be kept.
-        """
-        lost, contents, lines = self._lost(surveyed), surveyed.contents, list[str]()
-        if lost:
-            refuse_foreign(self.previous, KEPT)
-            lines.append(
-                f"{self.target} holds {lost}: it is kept as {self.previous} until the next "
-                "successful run, which takes their rows from it where they are there again"
-            )
-            contents |= set(_contents(self.target) or ())
-        for place in self.kept:
-            known, then = _contents(place), "replaced by it" if lost else "removed"
-            gone = "all its" if known is None else sum(one not in contents for one in known)
-            lines.append(
-                f"{place} is {then} when this run succeeds; {gone} episode(s) are only in there"
-            )
-        return lines
-
-    def put_in_place(self, build: StoreBuild, surveyed: Survey, say: Say) -> None:
-        """Seal a build, keep the store before it where episodes would be lost, and tidy up."""
-        keep = self._lost(surveyed) is not None
-        with closing(build):
-            build.seal(keep=keep)
-        for folder in self.aside:
-            remove_folder(folder, STORE)
-        if keep:
-            say(f"{self.previous}: the store of before, kept until the next successful run")
-        else:
-            for place in self.kept:
-                remove_folder(place, KEPT)
-
-    def _lost(self, surveyed: Survey) -> str | None:
-        """Which episodes of the store are not in the one that takes its place; None: all are."""
-        if self.finished in (None, surveyed.plan):
-            return None
-        if (known := _contents(self.target)) is None:
-            return "episodes that can no longer be told"
-        contents = surveyed.contents
-        lost = sum(content not in contents for content in known)
-        what = f"{lost} episode(s) that are not in this run (or whose files are read otherwise now)"
-        return what if lost else None
-
-    def refuse_to_lose(self, surveyed: Survey, embodiment: Embodiment) -> None:
-        """Raise `StoreMismatch` where rows would be lost that these params cannot give again.
-
-        Those of a merged store, or one under repair, with recordings that params do not name: who
-        follows the advice of a check may run under other params than that store's own. And those of
-        a store or build without an episode in common, of another embodiment or other sources only.
-        """
-        under_repair = self.finished is not None and self.finished == self.begun
-        # A store under repair may be one whose metadata are damaged: its build says what it holds.
-        target = None if under_repair else self.finished
-        for place, plan in ((self.target, target), (self.part, self.begun)):
-            if plan is not None:
-                _refuse_another(RowSource(place), surveyed, embodiment)
-        if not under_repair and not (self.finished or "").startswith(MERGED):
-            return
-        source = RowSource(self.part if under_repair else self.target)
-        if lost := {text.content for text in source.texts} - surveyed.contents:
-            what = "is under repair" if under_repair else "was merged of others"
-            raise StoreMismatch(
-                f"{self.target}: {what} and holds {len(lost)} episode(s) that the params do not "
-                "name. Give the --params it was made with (or run its merge again), name another "
-                "extract.store, or move it away."
-            )
-
-
-def row_sources(places: Sequence[Path], surveyed: Survey) -> list[RowSource]:
-    """The stores and laid-out builds of the same feature spec among these."""
-    digest, sources = surveyed.spec.digest, map(RowSource, places)
-    return [source for source in sources if source.said.feature_spec.digest == digest]
-
-
-def _refuse_another(source: RowSource, surveyed: Survey, embodiment: Embodiment) -> None:
-    known = {text.content for text in source.texts}
-    if not known or known & surveyed.contents or not source.rows:
-        return
-    there, here = source.said.sources, sorted({r.source for r in surveyed.recordings})
-    streams, now = source.said.raw["streams"], embodiment.document()
-    both = [name for name in now if streams[name]["names"] and now[name]["names"]]
-    apart = differences({name: streams[name] for name in both}, {name: now[name] for name in both})
-    differing = [f"; {line}" for line in describe(apart)]
-    if differing or not set(there) & set(here):
-        raise StoreMismatch(
-            f"{source.path}: holds the feature rows of {len(known)} episode(s), none of which is "
-            "in data.sources, and extraction would throw them away (sources: "
-            f"{', '.join(there)} there, {', '.join(here)} here{''.join(differing)}).\n"
-            "Name another extract.store, give the --params it was made with, or move it away."
-        )
-
-
-def _contents(store: Path) -> list[str] | None:
-    """The content digest of each episode; None where they can no longer be read."""
-    try:
-        return [text.content for text in RowSource(store).texts]
-    except StoreIncomplete:
-        return None
-
-
-def spec_differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
-    """What differs between two feature specs, without entries that only follow from others."""
-    differing = differences(before, now)
-    first = {
-        place: values
-        for place, values in differing.items()
-        if not place.startswith(("slots", "example_prompt"))
-    }
-    return describe(first or differing)[:_SHOWN]
+_DECIDES_SPEED = ("weights", "adapter", "processor", "compute_dtype", "variants")
 
 
 def plan_lines(
@@ -209,6 +19,7 @@ def plan_lines(
     surveyed: Survey,
     digests: ContentDigests,
     places: StorePlaces,
+    state: BuildState,
     sources: Sequence[RowSource],
     known: int,
 ) -> list[str]:
@@ -218,15 +29,14 @@ def plan_lines(
     """
     there = {text.digest for source in sources for text in source.texts}
     unchanged = sum(episode.digest in there for episode in surveyed.episodes)
-    resumes = places.begun == surveyed.plan
-    place = places.part if resumes or places.repaired else places.target
+    begun = places.begun == surveyed.plan
+    place = places.part if begun or places.repaired else places.target
     before = None if read_plan(place) is None else RowSource(place)
-    if resumes and places.layout_damage:
-        reasons = [f"{places.layout_damage}; streams are laid out again, the feature rows are kept"]
-    elif resumes:
-        repairs = places.finished == surveyed.plan
-        doing = "completing the repair" if repairs else "continuing the interrupted build"
+    if state == "resume":
+        doing = "completing the repair" if places.repaired else "continuing the interrupted build"
         reasons = [f"{doing} {places.part}"]
+    elif begun:
+        reasons = [f"{places.layout_damage}; streams are laid out again, the feature rows are kept"]
     else:
         reasons = _reasons(surveyed, before, build.specs)
     rows, variants = build.specs[FEATURES].shape[0], surveyed.spec.variants
@@ -263,7 +73,7 @@ def _reasons(
     if before is None:
         yield "there is no store yet"
         return
-    lines = spec_differences(before.said.raw["feature_spec"], surveyed.spec.attrs())
+    lines = spec_differences(before.attributes.raw["feature_spec"], surveyed.spec.attrs())
     yield from (f"feature spec, {line}" for line in lines)
     digests = {text.digest for text in before.texts}
     changed = [episode for episode in surveyed.episodes if episode.digest not in digests]
@@ -281,7 +91,7 @@ def _reasons(
         if name != FEATURES and before.specs[name].dtype != spec.dtype
     ]
     yield from dtypes
-    if unrated := before.said.action_hz is None:
+    if unrated := before.attributes.action_hz is None:
         yield "the store does not say the rate of its ticks"
     if not (lines or changed or gone or dtypes or unrated):
         yield "the order of episodes, or how actions are derived, changed"
@@ -290,7 +100,7 @@ def _reasons(
 def _warnings(surveyed: Survey, before: RowSource | None, missing: int) -> Iterator[str]:
     """What the user may not intend, each with the way out."""
     params, recordings, views = surveyed.params, surveyed.recordings, surveyed.spec.views
-    known = before.said.feature_spec.views if before else []
+    known = before.attributes.feature_spec.views if before else []
     if known and (added := set(views) - set(known)):
         having = sum(not added.isdisjoint(recording.view_names()) for recording in recordings)
         kept = setting("data.views", [view for view in known if view in views])
@@ -331,7 +141,7 @@ def count_known(
     """How many rows of these episodes are in `sources`, judged by frame times alone."""
     count = 0
     for episode in checked:
-        of = episode.said["content"], episode.said["instruction"]
+        of = episode.fields["content"], episode.fields["instruction"]
         times = set().union(*(source.keys_of(*of) for source in sources))
         rows = episode.ticks.frame_times(surveyed.spec.views)
         count += sum(row.tobytes() in times for row in rows)

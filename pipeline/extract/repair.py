@@ -1,13 +1,11 @@
-"""Begin the repair of a damaged store: take over what is sound, lay out anew what is not.
+"""Begin the repair of a damaged store: a build of its own plan that lacks the damaged rows.
 
-Everything is put together in `<name>.zarr.repair.part`, which becomes `<name>.zarr.part` by one
-rename at the end. So a kill leaves the damaged store as it was and nothing half begun, and what
-`stages.extract` then completes is a build like any other. The store itself is only read from.
+What is sound is linked or copied into `<name>.zarr.part`, what is not is laid out anew from the
+recordings; `stages.extract` computes the missing rows. The plan is written last: a kill leaves a
+part that the next repair empties. The damaged store is only read.
 """
 
-import shutil
 from contextlib import closing
-from pathlib import Path
 from shlex import quote
 
 import numpy as np
@@ -15,49 +13,71 @@ from tqdm import tqdm
 
 from pipeline.base.config import Params
 from pipeline.base.digests import ContentDigests, ledger_path
-from pipeline.base.durable import disk_full_named, sync
-from pipeline.base.durable import put_in_place as replace_folder
 from pipeline.base.errors import StoreMismatch
-from pipeline.base.ownership import begin_folder, remove_folder
-from pipeline.extract.layout import build_arrays, check_space, lay_out
-from pipeline.extract.plan import Say
+from pipeline.base.files import disk_full_named, remove_folder
+from pipeline.extract.layout import build_arrays, check_space, finish_layout, lay_out
+from pipeline.extract.state import Say
 from pipeline.extract.survey import sound_episodes, survey
 from pipeline.store import FEATURES, StoreBuild, build_lock, part_path, read_plan, recover
 from pipeline.store.chunks import ChunkFiles, read_rows, row_checksums
-from pipeline.store.paths import MERGED, STORE, refuse_replaced
+from pipeline.store.golden import GOLDEN
+from pipeline.store.metadata import ATTRIBUTE as METADATA_DIGEST
+from pipeline.store.metadata import SEAL
+from pipeline.store.paths import (
+    MERGED,
+    STORE,
+    group_attributes,
+    refuse_replaced,
+    unfinished_plans,
+)
 from pipeline.store.repair_hints import extract_command, gc_command
 from pipeline.store.schema import CHECKSUMS, INCREMENTAL, KEYS, chunk_paths, read_specs
 from pipeline.store.verification import Verification, read_arrays
 from pipeline.store.writer import environment_runs, sync_folders
 
 _BLOCK_BYTES = 2**26
+_NOT_TAKEN = ("plan", METADATA_DIGEST, SEAL, GOLDEN)
+"""Attributes of the damaged store that its build writes itself."""
 
 
 def repair(verification: Verification, params: Params, say: Say) -> None:
-    """Begin a build of the same plan without what is damaged; the store stays as it is meanwhile.
+    """Begin a build of the same plan without what is damaged.
 
-    Damaged feature rows are left out, to be computed again. Where anything else is damaged, it is
-    laid out anew from the recordings, which must be those that the store was made of; every sound
-    feature row keeps its place. Raises `StoreMismatch` where they are not, or where another build
-    is unfinished.
+    Where more than feature rows is damaged, streams, ticks and episodes are laid out anew from the
+    recordings, which must be those that the store was made of; every sound feature row keeps its
+    place. Raises `StoreMismatch` where they are not, or where another build is unfinished.
     """
     store = verification.store
+    part = part_path(store)
     with build_lock(store):
         recover(store)
         plan = read_plan(store) or ""
-        part = part_path(store)
-        if (unfinished := read_plan(part)) is not None:
-            what = "a repair of it has begun" if unfinished == plan else "a build is unfinished"
+        completed_by = extract_command(store)
+        if plan.startswith(MERGED):
+            merge = f"python -m stages.store merge --into {quote(str(store))}"
+            completed_by = f"the same {merge} that made it"
+        if unfinished := unfinished_plans(store):
+            what = "a repair of it has begun" if unfinished == [plan] else "a build is unfinished"
             raise StoreMismatch(
-                f"{part}: {what}. Run {_completed_by(store, unfinished)}, which completes it, or "
-                f"remove it: {gc_command(part)}"
+                f"{part}: {what}. Run {completed_by}, which completes it, or remove it: "
+                f"{gc_command(part)}"
             )
         try:
             with disk_full_named(store):
-                _begin(verification, plan, params, say)
+                if layout_is_sound(verification):
+                    rows, carried = begin_from_store(verification)
+                else:
+                    say("laying out streams, ticks and episodes again from the recordings")
+                    rows, carried = _begin_from_recordings(verification, plan, params, completed_by)
+                sync_folders(part)
         except BaseException:
-            remove_folder(part_path(_repaired(store)), STORE)
+            remove_folder(part, STORE)
             raise
+    say(
+        f"{part}: a new build, {carried} of {rows} feature rows taken over, {rows - carried} to "
+        "compute"
+    )
+    say(f"run next: {completed_by}, which completes it and then replaces the store")
 
 
 def layout_is_sound(verification: Verification) -> bool:
@@ -67,30 +87,62 @@ def layout_is_sound(verification: Verification) -> bool:
     )
 
 
-def copy_layout(store: Path) -> StoreBuild:
-    """A build with the metadata of a store, and its chunk files but those written row by row."""
+def begin_from_store(verification: Verification) -> tuple[int, int]:
+    """Begin the build with the chunks of a store whose layout is sound, and its sound rows.
+
+    Returns how many feature rows the store has and how many of them the build has.
+    """
+    store = verification.store
     specs = read_specs(store)
-    build = StoreBuild(_repaired(store), specs, read_plan(store) or "")
-    with disk_full_named(build.part):
-        begin_folder(build.part, STORE)
-        for metadata in store.glob("**/zarr.json"):
-            _copy(metadata, build.part / metadata.relative_to(store))
-        others = sorted(set(specs) - set(INCREMENTAL))
+    with closing(StoreBuild(store, specs, read_plan(store) or "")) as build:
+        build.create()
+        others = [name for name in specs if name not in INCREMENTAL]
         for name in tqdm(others, "take over", unit="array", disable=None, leave=False):
             files = build.files(name)
             for chunk, path in enumerate(chunk_paths(store, specs[name])):
-                if not files.link(chunk, path):
-                    _copy(path, files.paths[chunk])
-    return build
+                files.link(chunk, path)
+            files.allocate()
+            for chunk in range(specs[name].chunk_count):
+                if not files.is_linked(chunk):
+                    rows = specs[name].chunk_rows_of(chunk)
+                    files.write(rows.start, read_rows(store, specs[name], rows.start, rows.stop))
+        carried = _carry_rows(verification, build)
+        attributes = group_attributes(store)
+        kept = {name: value for name, value in attributes.items() if name not in _NOT_TAKEN}
+        build.finish_layout(kept, group_attributes(store / "vl"))
+    return specs[FEATURES].shape[0], carried
 
 
-def carry_rows(store: Path, build: StoreBuild, verification: Verification) -> int:
+def _begin_from_recordings(
+    verification: Verification, plan: str, params: Params, completed_by: str
+) -> tuple[int, int]:
+    """As `begin_from_store`, with everything but the feature rows from the recordings."""
+    store = verification.store
+    with closing(ContentDigests(ledger_path(store))) as digests:
+        surveyed, checked = sound_episodes(survey(params, digests), digests)
+    if surveyed.plan != plan:
+        raise StoreMismatch(
+            f"{store}: metadata, streams, ticks or episodes are damaged, and the params describe "
+            "another store than this one. Restore its recordings and params, or run "
+            f"{completed_by}, which takes over every row whose frames it knows."
+        )
+    with closing(StoreBuild(store, build_arrays(checked, surveyed), plan)) as build:
+        check_space(build, checked, ())
+        lay_out(build, checked, surveyed, ())
+        shapes = {name: spec.shape for name, spec in read_arrays(store)[0].items()}
+        readable = all(shapes.get(name) == build.specs[name].shape for name in INCREMENTAL)
+        carried = _carry_rows(verification, build) if readable else 0
+        finish_layout(build, checked, surveyed)
+    return build.specs[FEATURES].shape[0], carried
+
+
+def _carry_rows(verification: Verification, build: StoreBuild) -> int:
     """Take the sound feature rows over, each to its place, and mark them; returns how many.
 
-    Not those whose key lies in a damaged chunk of keys, for a key has no checksum of its own. The
-    rows that are not marked are for `stages.extract` to compute. Raises `StoreMismatch` where
-    another store took the place of the one that was checked.
+    Not those whose key lies in a damaged chunk of keys, for a key has no checksum of its own.
+    Raises `StoreMismatch` where another store took the place of the one that was checked.
     """
+    store = verification.store
     refuse_replaced(store, verification.inode)
     sound = np.ones(build.specs[FEATURES].shape[0], np.bool_)
     sound[verification.bad_rows] = False
@@ -122,62 +174,3 @@ def carry_rows(store: Path, build: StoreBuild, verification: Verification) -> in
         files.sync()
     build.files(CHECKSUMS).sync()
     return int(sound.sum())
-
-
-def put_in_place(build: StoreBuild, store: Path) -> None:
-    """Make it the build of the store that `stages.extract` goes on with."""
-    build.close()
-    sync_folders(build.part)
-    replace_folder(build.part, part_path(store), STORE)
-
-
-def _begin(verification: Verification, plan: str, params: Params, say: Say) -> None:
-    store, sound = verification.store, layout_is_sound(verification)
-    if not sound:
-        say("laying out streams, ticks and episodes again from the recordings")
-    with closing(copy_layout(store) if sound else _lay_out_anew(store, plan, params)) as build:
-        rows = build.specs[FEATURES].shape[0]
-        specs, _ = read_arrays(store)
-        readable = all(
-            name in specs and specs[name].shape == build.specs[name].shape for name in INCREMENTAL
-        )
-        carried = carry_rows(store, build, verification) if readable else 0
-        put_in_place(build, store)
-    say(
-        f"{part_path(store)}: a new build, {carried} of {rows} feature rows taken over, "
-        f"{rows - carried} to compute"
-    )
-    say(f"run next: {_completed_by(store, plan)}, which completes it and then replaces the store")
-
-
-def _lay_out_anew(store: Path, plan: str, params: Params) -> StoreBuild:
-    """Everything but the feature rows, from the recordings."""
-    with closing(ContentDigests(ledger_path(store))) as digests:
-        surveyed, checked = sound_episodes(survey(params, digests), digests)
-    if surveyed.plan != plan:
-        raise StoreMismatch(
-            f"{store}: metadata, streams, ticks or episodes are damaged, and the params describe "
-            "another store than this one. Restore its recordings and params, or run "
-            f"{_completed_by(store, plan)}, which takes over every row whose frames it knows."
-        )
-    build = StoreBuild(_repaired(store), build_arrays(checked, surveyed), plan)
-    check_space(build, checked, ())
-    lay_out(build, checked, surveyed, ())
-    return build
-
-
-def _repaired(store: Path) -> Path:
-    """The target under which a build for the repair of this store is put together."""
-    return store.with_name(store.name + ".repair")
-
-
-def _completed_by(store: Path, plan: str) -> str:
-    if plan.startswith(MERGED):
-        return f"the same stages.store merge --into {quote(str(store))} that made it"
-    return extract_command(store)
-
-
-def _copy(path: Path, to: Path) -> None:
-    to.parent.mkdir(parents=True, exist_ok=True)
-    shutil.copyfile(path, to)
-    sync(to)

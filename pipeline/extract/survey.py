@@ -169,7 +169,7 @@ def sound_episodes(
     spec, plan = _spec_and_plan(surveyed.params, sound, digests)
     bad = (*surveyed.bad, *(bad for _, bad in failed))
     again = replace(surveyed, episodes=tuple(sound), bad=bad, spec=spec, plan=plan)
-    return again, [episode for episode in checked if episode.said["digest"] not in unusable]
+    return again, [episode for episode in checked if episode.fields["digest"] not in unusable]
 
 
 def check_episodes(

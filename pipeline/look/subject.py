@@ -11,7 +11,7 @@ from shlex import quote
 from pipeline.base.commands import command
 from pipeline.base.config import InspectParams, Params, Source
 from pipeline.base.errors import ConfigError, RecordingError
-from pipeline.base.ownership import REPORT, refuse_foreign
+from pipeline.base.files import REPORT, refuse_foreign
 from pipeline.data import Opened, open_recordings
 from pipeline.data.discovery import meant
 
@@ -52,7 +52,8 @@ def subject_of(params: Params) -> Subject:
     places = (wanted.path,) if isinstance(wanted.path, str) else wanted.path or ()
     _check_output(wanted.output)
     folder = _folder(wanted, places)
-    refuse_foreign(folder, REPORT)
+    for place in (wanted.output, folder):
+        refuse_foreign(place, REPORT)
     if not places:
         names = ", ".join(source.name for source in params.data.sources)
         return Subject(names, folder, None, params.data.sources, params.data.root)

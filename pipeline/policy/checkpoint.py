@@ -16,8 +16,10 @@ from numpy.typing import NDArray
 
 from pipeline.base.config import TrainHeadParams
 from pipeline.base.differences import describe, differences
-from pipeline.base.durable import (
+from pipeline.base.errors import CheckpointIncomplete, CheckpointMismatch, PipelineError
+from pipeline.base.files import (
     RUN_FILES,
+    OutputKind,
     check_digest,
     read_document,
     read_tensors,
@@ -25,9 +27,7 @@ from pipeline.base.durable import (
     write_tensors,
     write_with_digest,
 )
-from pipeline.base.errors import CheckpointIncomplete, CheckpointMismatch, PipelineError
 from pipeline.base.golden import GoldenRow, row_key
-from pipeline.base.ownership import OutputKind
 from pipeline.base.tuned_on import EpisodePart, Side
 from pipeline.policy.document import FORMAT, PolicyDocument
 from pipeline.policy.normalization import Normalization

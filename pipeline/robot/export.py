@@ -26,10 +26,9 @@ from torch import Tensor, nn
 from torch.export import Dim, ExportedProgram
 
 from pipeline.base.config import ExportParams
-from pipeline.base.durable import replace_folder, sha256_of, write_document
 from pipeline.base.errors import ConfigError, NumericsError
+from pipeline.base.files import OutputKind, replace_folder, sha256_of, write_document
 from pipeline.base.observation import Observation
-from pipeline.base.ownership import OutputKind
 from pipeline.policy.checkpoint import PolicyCheckpoint
 from pipeline.policy.expert import Chunk
 from pipeline.policy.observation import AGES

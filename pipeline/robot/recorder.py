@@ -17,8 +17,8 @@ import av
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pipeline.base.durable import FULL
 from pipeline.base.errors import DiskFull, RecordingError
+from pipeline.base.files import FULL
 from pipeline.robot.run_recording import (
     READINGS,
     Log,

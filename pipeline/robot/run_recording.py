@@ -25,9 +25,15 @@ from pydantic import ConfigDict
 
 from pipeline.base.arrays import non_finite
 from pipeline.base.border import Document, Text
-from pipeline.base.durable import sync, write_document
 from pipeline.base.errors import RecordingError
-from pipeline.base.ownership import OutputKind, begin_folder, remove_folder, unmark
+from pipeline.base.files import (
+    OutputKind,
+    begin_folder,
+    remove_folder,
+    sync,
+    unmark,
+    write_document,
+)
 from pipeline.data.lerobot import ACTION, STATE
 from pipeline.data.lerobot_writer import write_sidecar, write_v30
 from pipeline.data.media import RECORDINGS

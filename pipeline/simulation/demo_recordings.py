@@ -17,12 +17,11 @@ import numpy as np
 from pydantic import Field
 from tqdm import tqdm
 
-from pipeline.base import ownership
+from pipeline.base import files
 from pipeline.base.border import Border, Document, Text
 from pipeline.base.digests import joint_digest
-from pipeline.base.durable import disk_full_named, write_document
 from pipeline.base.errors import ConfigError
-from pipeline.base.ownership import OutputKind, remove_folder, there
+from pipeline.base.files import OutputKind, disk_full_named, remove_folder, there, write_document
 from pipeline.simulation.insertion_formats import (
     ABUTTING,
     OVERLAPPING,
@@ -36,7 +35,7 @@ from pipeline.simulation.recorder import SimulatedEpisode, simulate_episode
 DEMO_VERSION: Final = 2
 """To raise whenever the same seed gives other recordings."""
 MARKER: Final = "demo.json"
-_MARKERS: Final = {MARKER, ownership.MARKER}
+_MARKERS: Final = {MARKER, files.MARKER}
 DEMO: Final = OutputKind("what the demo wrote", lambda folder: (folder / MARKER).is_file())
 _SET: Final = OutputKind("a set of the demo's", lambda folder: DEMO.is_one(folder.parent))
 TASK: Final = "Insert_the_needle_at_the_red_point"

@@ -33,9 +33,15 @@ from zarr.storage import LocalStore, StorePath
 
 from pipeline.base.border import Border, Document, Text, shown
 from pipeline.base.digests import file_digest
-from pipeline.base.durable import disk_full_named, put_in_place, sync
 from pipeline.base.errors import PipelineError, StoreIncomplete, StoreMismatch
-from pipeline.base.ownership import OutputKind, begin_folder, remove_folder
+from pipeline.base.files import (
+    OutputKind,
+    begin_folder,
+    disk_full_named,
+    put_in_place,
+    remove_folder,
+    sync,
+)
 from pipeline.store.border import Group, Length, StoreAttributes, store_border
 from pipeline.store.chunks import Seal, check_seal, check_trailers, read_rows, sealed_trailer
 from pipeline.store.golden import GOLDEN, read_golden
@@ -47,9 +53,9 @@ from pipeline.store.paths import (
     group_attributes,
     inode_of,
     part_path,
-    read_plan,
     recover,
     refuse_replaced,
+    unfinished_plans,
 )
 from pipeline.store.reader import FeatureStore
 from pipeline.store.repair_hints import extract_command, gc_command
@@ -444,7 +450,7 @@ def _copy_golden(root: Path, to: Path, digests: Mapping[str, str]) -> None:
 def _refuse_build(target: Path) -> None:
     """An unfinished extraction or repair may hold rows that exist nowhere else, of any plan."""
     part = part_path(target)
-    if read_plan(part) is not None:
+    if unfinished_plans(target):
         raise StoreMismatch(
             f"{part}: expected nothing there, found an unfinished build. Finish it with "
             f"{extract_command(target)}, remove it with {gc_command(part)}, or set archive.store."

@@ -18,8 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from pipeline.base.durable import disk_full_named, sync
 from pipeline.base.errors import StoreIncomplete
+from pipeline.base.files import disk_full_named, sync
 from pipeline.store.border import store_border
 from pipeline.store.metadata import SEAL, check_metadata, note_metadata
 from pipeline.store.paths import group_attributes, laid_out_attributes

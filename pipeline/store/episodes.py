@@ -17,8 +17,8 @@ from pipeline.base.border import shown
 from pipeline.store.border import EpisodeText, store_border
 from pipeline.store.schema import POSITIONS, STREAMS
 
-SAID = tuple(name for name in EpisodeText.model_fields if name != "group")
-"""What `episode/text` says of each episode; beside it `group`, where the recording names one."""
+FIELDS = tuple(name for name in EpisodeText.model_fields if name != "group")
+"""The entries of an episode in `episode/text`; `group` stands there too where it is known."""
 
 
 @dataclass(frozen=True)
@@ -44,9 +44,9 @@ class Episode:
 
     @property
     def text(self) -> bytes:
-        """What `episode/text` says of it."""
+        """Its JSON object in `episode/text`."""
         group = {} if self.group is None else {"group": self.group}
-        return _text({name: getattr(self, name) for name in SAID} | group)
+        return _text({name: getattr(self, name) for name in FIELDS} | group)
 
     @property
     def counts(self) -> dict[str, int]:
@@ -55,12 +55,12 @@ class Episode:
         return {**rows, "text": len(self.text)}
 
 
-def _text(said: Mapping[str, str]) -> bytes:
-    return json.dumps(said, ensure_ascii=False).encode()
+def _text(fields: Mapping[str, str]) -> bytes:
+    return json.dumps(fields, ensure_ascii=False).encode()
 
 
 def read_texts(root: Path, arrays: Mapping[str, NDArray[Any]]) -> list[EpisodeText]:
-    """What `episode/text` says of each episode.
+    """The texts of all episodes, in order.
 
     Raises `StoreIncomplete` naming the episode whose text is broken.
     """
@@ -128,7 +128,7 @@ def read_episodes(
 
 @dataclass(frozen=True)
 class EpisodeRows:
-    """How many rows of each stream an episode has, and what is said of it."""
+    """How many rows of each stream an episode has, and its entries in `episode/text`."""
 
     ticks: Any
     """A `pipeline.data.timeline.Timeline`, or what says the same: ticks with indices into the
@@ -136,13 +136,13 @@ class EpisodeRows:
     readings: int
     states: int
     source: str
-    said: Mapping[str, str]
-    """The fields named in `SAID`, and `group` where the recording names one."""
+    fields: Mapping[str, str]
+    """The fields named in `FIELDS`, and `group` where the recording names one."""
 
     @property
     def text(self) -> bytes:
-        """What is said, as JSON."""
-        return _text(self.said)
+        """Its JSON object in `episode/text`."""
+        return _text(self.fields)
 
     @property
     def counts(self) -> dict[str, int]:

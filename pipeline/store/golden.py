@@ -18,8 +18,8 @@ from numcodecs import Zstd
 from numpy.typing import NDArray
 from zarr.codecs import BytesCodec, Crc32cCodec, ZstdCodec
 
-from pipeline.base.durable import disk_full_named, sync
 from pipeline.base.errors import StoreIncomplete
+from pipeline.base.files import disk_full_named, sync
 from pipeline.base.golden import row_key
 from pipeline.base.issue import Issue
 from pipeline.store.border import FrameDocument, StoreAttributes, StoredGolden, store_border

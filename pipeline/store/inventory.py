@@ -19,17 +19,16 @@ from typing import Literal
 import numpy as np
 
 from pipeline.base.commands import command
-from pipeline.base.digests import is_ledger
-from pipeline.base.durable import HELD, KEPT
+from pipeline.base.digests import LEDGER_SUFFIX, is_ledger
 from pipeline.base.errors import ConfigError, PipelineError, StoreIncomplete, StoreLocked
+from pipeline.base.files import HELD, OutputKind, remove_folder
 from pipeline.base.format import size
-from pipeline.base.ownership import LEDGER_SUFFIX, OutputKind, remove_folder
 from pipeline.base.table import Table
 from pipeline.store.archive import ARCHIVE, is_archive, read_manifest
 from pipeline.store.border import StoreAttributes
 from pipeline.store.chunks import read_rows
 from pipeline.store.lock import build_lock, lock_holder
-from pipeline.store.paths import STORE, is_store, laid_out_attributes
+from pipeline.store.paths import KEPT, STORE, is_store, laid_out_attributes
 from pipeline.store.reader import FeatureStore
 from pipeline.store.repair_hints import gc_command
 from pipeline.store.schema import CHECKSUMS, FEATURES, ArraySpec, read_spec, read_specs

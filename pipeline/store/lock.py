@@ -15,7 +15,7 @@ from typing import TextIO
 
 from pipeline.base.border import Border
 from pipeline.base.errors import ConfigError, StoreLocked
-from pipeline.base.ownership import there
+from pipeline.base.files import there
 
 _BEAT_S = 10.0
 """How often the holder shows that it lives."""

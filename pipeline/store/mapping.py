@@ -6,9 +6,8 @@ private and copy-on-write: a write by mistake changes neither the file nor kills
 
 How a map is paged in depends on whether it fits in memory. What fits is populated once: every page
 is read in the files' order and entered in the page table, so that no gather stops at a page fault.
-Of what does not, the kernel is told to read no page but those asked for, and each batch's rows are
-asked for at once before the first is copied; without that, read-ahead brings hundreds of times the
-useful bytes.
+For what does not fit, the kernel reads only pages that are asked for, and each batch asks for all
+its rows before it copies the first; otherwise read-ahead brings hundreds of times the useful bytes.
 """
 
 import ctypes

@@ -41,6 +41,7 @@ from pipeline.store.paths import (
     read_plan,
     recover,
     refuse_replaced,
+    unfinished_plans,
 )
 from pipeline.store.reader import FeatureStore
 from pipeline.store.schema import (
@@ -225,8 +226,9 @@ def _checked_output(inputs: Sequence[Path], output: Path | None) -> Path:
 
 def _check_free(output: Path, plan: str) -> None:
     """Refuse where something else stands, or is being built, in the place of the output."""
-    for place in (output, part_path(output)):
-        if read_plan(place) not in (None, plan):
+    plans = {output: {read_plan(output)}, part_path(output): {*unfinished_plans(output)}}
+    for place, found in plans.items():
+        if found - {None, plan}:
             raise StoreMismatch(
                 f"{place}: expected nothing there, or a merge of these very stores; found another. "
                 "Choose another name with --into, or remove it."

@@ -1,4 +1,4 @@
-"""A digest of all that a store says of itself: an attribute has no checksum of its own.
+"""A digest of all metadata of a store: an attribute has no checksum of its own.
 
 It covers the `zarr.json` of the root, of each group and of each array, as JSON of sorted keys; the
 root's without the digest itself. A finished store's root lists the checksum of every chunk file in

@@ -1,25 +1,75 @@
-"""Where a store lies, what lies beside it, and whether what lies there is one."""
+"""The three places of a store, and the steps that take a build from one to the next.
 
+    <name>.zarr            the finished store, never modified
+    <name>.zarr.part       the build; `.known/<n>` in it are interrupted builds of other plans
+    <name>.zarr.previous   the replaced store, kept and marked, where it has more episodes
+
+Whoever changes one of them holds `<name>.zarr.lock` and calls `recover` first. A part goes through
+these states; rows are known from the store, the previous one, a part with a plan and its `.known`:
+
+    begin_build      finish_layout        finish          put_in_place
+    ──────────► bare ────────────► laid out ─────► sealed ────────────► <name>.zarr
+                 ▲   (the plan is  │  ▲  │ rows are committed, batch by batch
+                 │    the last     │  └──┘
+                 │    thing)       │
+                 └─────────────────┘ set_build_aside: another plan begins
+
+A kill leaves:
+- a bare part: the next build empties it, `.known` stays.
+- a part laid out: the same plan goes on, another one sets it aside.
+- half of `set_build_aside`: `recover` completes it.
+- a sealed part without a store, which lies in `.replaced` of that part (from where `recover` brings
+  it back) or, where it is to be kept, as the previous one: the same plan only renames the part.
+- a new store with `.known` or `.replaced` still in it: `recover` removes these.
+"""
+
+import glob
+import os
+from itertools import count
 from pathlib import Path
 from typing import Any
 
+from pipeline.base import files
 from pipeline.base.border import Border, shown
-from pipeline.base.durable import recover as recover_replaced
-from pipeline.base.errors import StoreIncomplete, StoreMismatch
-from pipeline.base.ownership import OutputKind, described, refuse_foreign, there
+from pipeline.base.errors import ConfigError, StoreIncomplete, StoreMismatch
+from pipeline.base.files import (
+    MARKER,
+    OutputKind,
+    begin_folder,
+    claim,
+    described,
+    mark,
+    refuse_foreign,
+    remove_folder,
+    there,
+    unmark,
+)
 from pipeline.store.border import Group, StoreAttributes
-from pipeline.store.repair_hints import extract_command, mend, restore_command, start_over
+from pipeline.store.repair_hints import (
+    KNOWN,
+    extract_command,
+    mend,
+    restore_command,
+    start_over,
+)
 from pipeline.store.schema import SCHEMA
 
 MERGED = "merge-"
 """How the plan of a store begins that was not extracted but merged."""
 
+_MOVED_LAST = ".zarr.json"
+"""What `set_build_aside` calls the metadata of a build until the rest of it has moved."""
 Inode = tuple[int, int]
 
 
 def part_path(target: Path) -> Path:
     """Where a store is built."""
     return target.with_name(target.name + ".part")
+
+
+def previous_path(target: Path) -> Path:
+    """Where the store that was replaced is kept."""
+    return target.with_name(target.name + ".previous")
 
 
 def is_store(path: Path) -> bool:
@@ -29,6 +79,17 @@ def is_store(path: Path) -> bool:
 
 
 STORE = OutputKind("a feature store", is_store)
+_LINK_ENDS = "/."
+"""How a link ends that was kept: nothing is written into the folder behind it."""
+
+
+def _is_kept_link(path: Path) -> bool:
+    # A Path would leave the end out.
+    return path.is_symlink() and os.readlink(path).endswith(_LINK_ENDS)  # noqa: PTH115
+
+
+KEPT = OutputKind("a store of before, kept for its rows,", _is_kept_link)
+"""The previous store, by its marker, whose line earlier versions wrote: a user's copy is none."""
 
 
 def refuse_foreign_store(target: Path) -> None:
@@ -38,12 +99,86 @@ def refuse_foreign_store(target: Path) -> None:
 
 
 def recover(target: Path) -> None:
-    """Undo or complete a replacement that a kill stopped, before anything is written there.
+    """Complete or undo what a kill stopped, before anything is written there.
 
-    Raises `ConfigError` where something lies there that this project did not write.
+    Raises `ConfigError` where something lies there that this project did not write, or that an
+    earlier version left.
     """
     refuse_foreign_store(target)
-    recover_replaced(target, STORE)
+    part = part_path(target)
+    for suffix in ("repair.part", "keeping"):
+        if there(left := target.with_name(f"{target.name}.{suffix}")):
+            raise ConfigError(
+                f"{left}: an earlier version left it when it was stopped. If there is no {target} "
+                f"and a {left / target.name}, move that there. Remove {left} and run this again."
+            )
+    if KEPT.marks(target):
+        unmark(target)
+    files.recover(part, target, STORE)
+    remove_folder(target / KNOWN, STORE)
+    for left in sorted(target.parent.glob(f"{glob.escape(target.name)}.known-*")):
+        if left.name.rpartition("-")[2].isdigit() and is_store(left):  # of earlier versions
+            left.rename(_place_aside(part))
+    for moving in part.glob(f"{KNOWN}/*/{_MOVED_LAST}"):
+        _move_build(part, moving.parent)
+
+
+def begin_build(target: Path) -> None:
+    """Make an empty part, in place of what was begun there; builds that were set aside stay."""
+    begin_folder(part_path(target), STORE, but=KNOWN)
+
+
+def set_build_aside(target: Path) -> None:
+    """Move the build into `.known` of its own part, where its rows stay known."""
+    part = part_path(target)
+    folder = _place_aside(part)
+    folder.mkdir()
+    (part / "zarr.json").rename(folder / _MOVED_LAST)
+    _move_build(part, folder)
+
+
+def builds_aside(target: Path) -> list[Path]:
+    """The builds that were set aside."""
+    return [path for path in sorted((part_path(target) / KNOWN).glob("*")) if is_store(path)]
+
+
+def unfinished_plans(target: Path) -> list[str]:
+    """The plans of the build and of those that were set aside."""
+    plans = (read_plan(place) for place in (part_path(target), *builds_aside(target)))
+    return [plan for plan in plans if plan is not None]
+
+
+def put_in_place(target: Path, keep: bool = False) -> None:
+    """Rename a sealed part to the store; remove what was there, or `keep` it as the previous one.
+
+    Of a store behind a symbolic link the link alone goes; one that is kept is a link to the same
+    folder. Raises `ConfigError` where something that is not this project's lies in a place.
+    """
+    previous = previous_path(target)
+    if keep and there(target):
+        remove_folder(previous, KEPT)
+        if target.is_symlink():
+            previous.symlink_to(os.path.realpath(target) + _LINK_ENDS)
+            target.unlink()
+        else:
+            mark(target, KEPT)
+            target.rename(previous)
+    files.put_in_place(part_path(target), target, STORE)
+    remove_folder(target / KNOWN, STORE)
+
+
+def _place_aside(part: Path) -> Path:
+    """A free place in `.known`."""
+    for folder in (part, part / KNOWN):
+        claim(folder, STORE)
+    return next(path for number in count() if not (path := part / KNOWN / str(number)).exists())
+
+
+def _move_build(part: Path, folder: Path) -> None:
+    for entry in part.iterdir():
+        if entry.name not in (MARKER, KNOWN):
+            entry.rename(folder / entry.name)
+    (folder / _MOVED_LAST).rename(folder / "zarr.json")
 
 
 def read_plan(store: Path) -> str | None:
@@ -88,7 +223,7 @@ def find_attributes(root: Path) -> dict[str, Any]:
         )
     if "schema" not in attributes:
         part = root if build else part_path(root)
-        target = root.with_name(root.name.removesuffix(".part").removesuffix(".repair"))
+        target = root.with_name(root.name.removesuffix(".part"))
         found, then = "nothing there", f"Run {extract_command(target)}."
         if part.exists():
             found = f"only the unfinished build {part}"

@@ -67,12 +67,12 @@ class FeatureStore:
         it follows another schema.
         """
         root = Path(path)
-        said, specs = read_attributes(root), read_specs(root)
-        check_agreement(root, said, specs)
-        check_seal(root, said.seal, specs)
+        attributes, specs = read_attributes(root), read_specs(root)
+        check_agreement(root, attributes, specs)
+        check_seal(root, attributes.seal, specs)
         arrays = {name: map_array(root, spec) for name, spec in specs.items()}
         check_index(root, arrays, rows_of(specs))
-        return cls(root, said.raw, arrays)
+        return cls(root, attributes.raw, arrays)
 
     def __reduce__(self) -> tuple[Any, ...]:
         return FeatureStore.open, (self.path,)

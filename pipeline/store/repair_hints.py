@@ -10,9 +10,9 @@ from pathlib import Path
 from pipeline.base.commands import command
 from pipeline.base.config import setting
 
-_STORE = re.compile(
-    r"(?P<base>.+?\.zarr)(?P<unfinished>(?:\.repair)?\.part|\.known-\d+|\.previous)?"
-)
+KNOWN = ".known"
+"""The folder in a part that holds interrupted builds of other plans."""
+_STORE = re.compile(r"(?P<base>.+?\.zarr)(?:\.part|\.previous)?")
 
 
 def extract_command(store: Path) -> str:
@@ -36,6 +36,9 @@ def restore_command(archive: Path) -> str:
 def mend(path: Path) -> str:
     """What to do about a damaged store or build, of which `path` is the folder or a file in it."""
     folder, store = _owner(path)
+    for place in (path, *path.parents):
+        if place.parent.name == KNOWN:
+            return f"Remove {place}, then run {extract_command(store)}."
     if folder != store:
         return f"Remove it with {gc_command(folder)}, then run {extract_command(store)}."
     repair = command("verify", "--repair", setting("verify.store", store))

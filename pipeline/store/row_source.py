@@ -35,9 +35,9 @@ class RowSource:
     def __init__(self, path: Path) -> None:
         self.path = path
         self.specs: dict[str, ArraySpec] = read_specs(path)
-        self.said = laid_out_attributes(path)
+        self.attributes = laid_out_attributes(path)
         """Its root attributes."""
-        check_agreement(path, self.said, self.specs)
+        check_agreement(path, self.attributes, self.specs)
         self._arrays: dict[str, NDArray[Any]] = {}
 
     @cached_property
@@ -88,7 +88,7 @@ class RowSource:
     @cached_property
     def _environments(self) -> list[dict[str, Any]]:
         log = EnvironmentLog(self.path)
-        return log.ranges() if log.noted else self.said.raw.get("environment", [])
+        return log.ranges() if log.noted else self.attributes.raw.get("environment", [])
 
     @cached_property
     def texts(self) -> list[EpisodeText]:
@@ -110,6 +110,6 @@ class RowSource:
         """All of a small array, read once."""
         if name not in self._arrays:
             if self._finished:
-                check_chunks(self.path, [self.specs[name]], self.said.seal)
+                check_chunks(self.path, [self.specs[name]], self.attributes.seal)
             self._arrays[name] = read_rows(self.path, self.specs[name])
         return self._arrays[name]

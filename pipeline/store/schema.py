@@ -256,17 +256,17 @@ _CHOSEN = {FEATURES: ("float32", "float16", "uint16"), "sensor/values": ("float3
 
 def array_of(document: dict[str, Any], name: str, where: Path | str, border: Border) -> ArraySpec:
     """The array that metadata describe; refused where they are not as the contract says."""
-    found = border.parse(document, ArrayDocument, where)
+    array = border.parse(document, ArrayDocument, where)
     code, *axes = _ARRAYS[name]
-    if len(found.shape) != len(axes):
-        raise border.refusal(where, f"expected the axes {axes}, found the shape {found.shape}")
+    if len(array.shape) != len(axes):
+        raise border.refusal(where, f"expected the axes {axes}, found the shape {array.shape}")
     allowed = _CHOSEN.get(name) or (np.dtype(code).name,)
-    dtype = found.data_type if found.data_type in allowed else allowed[0]
-    spec = ArraySpec(name, tuple(found.shape), np.dtype(dtype).newbyteorder("<"))
+    dtype = array.data_type if array.data_type in allowed else allowed[0]
+    spec = ArraySpec(name, tuple(array.shape), np.dtype(dtype).newbyteorder("<"))
     if spec.row_bytes > _MOST_ROW_BYTES:
-        what = f"expected rows of at most {_MOST_ROW_BYTES:,} bytes, found the shape {found.shape}"
+        what = f"expected rows of at most {_MOST_ROW_BYTES:,} bytes, found the shape {array.shape}"
         raise border.refusal(where, what)
-    rows = found.chunk_rows
+    rows = array.chunk_rows
     whole = max(1, math.ceil(spec.shape[0] / ROW_MULTIPLE)) * ROW_MULTIPLE
     most = max(ROW_MULTIPLE, _MOST_CHUNK_BYTES // max(1, spec.row_bytes))
     if 0 < rows <= min(whole, most) and rows % ROW_MULTIPLE == 0:
@@ -300,14 +300,14 @@ def rows_of(specs: Mapping[str, ArraySpec]) -> dict[str, int]:
 
 
 def check_agreement(
-    root: Path, said: StoreAttributes, specs: Mapping[str, ArraySpec], border: Border | None = None
+    root: Path, attrs: StoreAttributes, specs: Mapping[str, ArraySpec], border: Border | None = None
 ) -> None:
     """Raise `StoreIncomplete` where the arrays of a store do not fit each other, or its attributes
     say other widths than they have."""
     border = border or store_border(root)
     for name, what in disagreements(specs):
         raise border.refusal(root / name / "zarr.json", what)
-    streams, spec = said.streams, said.feature_spec
+    streams, spec = attrs.streams, attrs.feature_spec
     pairs = {
         "streams.action.names": (streams.action.names, specs["tick/action"].shape[1]),
         "streams.action.units": (streams.action.units, specs["tick/action"].shape[1]),
@@ -322,6 +322,6 @@ def check_agreement(
     if len(spec.slots) % spec.variants:
         wrong.append(f"feature_spec.variants: expected a divisor of {len(spec.slots)} slots")
     rows = specs[FEATURES].shape[0]
-    wrong += [f"golden: row {one.row} of {rows}" for one in said.golden if one.row >= rows]
+    wrong += [f"golden: row {row.row} of {rows}" for row in attrs.golden if row.row >= rows]
     if wrong:
         raise border.refusal(root / "zarr.json", "; ".join(wrong))

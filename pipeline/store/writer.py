@@ -21,9 +21,8 @@ import numpy as np
 import zarr
 from numpy.typing import NDArray
 
-from pipeline.base.durable import disk_full_named, put_in_place, sync
 from pipeline.base.errors import StoreIncomplete
-from pipeline.base.ownership import begin_folder
+from pipeline.base.files import disk_full_named, sync
 from pipeline.store.border import store_border
 from pipeline.store.chunks import (
     ChunkFiles,
@@ -35,7 +34,7 @@ from pipeline.store.chunks import (
 )
 from pipeline.store.golden import GoldenFrames, write_golden
 from pipeline.store.metadata import metadata_damage, note_metadata
-from pipeline.store.paths import STORE, group_attributes, part_path
+from pipeline.store.paths import begin_build, group_attributes, part_path, put_in_place
 from pipeline.store.schema import CHECKSUMS, FEATURES, INCREMENTAL, KEYS, ArraySpec, chunk_path
 
 Rows = Sequence[int] | NDArray[np.int64]
@@ -131,7 +130,7 @@ class StoreBuild:
     def create(self) -> None:
         """Begin from nothing: metadata of every array, then the space for its rows."""
         with disk_full_named(self.part):
-            begin_folder(self.part, STORE)
+            begin_build(self.target)
             for spec in self.specs.values():
                 spec.create(self.part)
 
@@ -143,7 +142,7 @@ class StoreBuild:
     def linkable(self, name: str, source_spec: ArraySpec, rows: int) -> int:
         """How many chunks lie wholly in the first `rows` rows and are cut as the other's are."""
         spec = self.specs[name]
-        cuts = {(one.chunk_rows, one.row_bytes, one.dtype) for one in (spec, source_spec)}
+        cuts = {(cut.chunk_rows, cut.row_bytes, cut.dtype) for cut in (spec, source_spec)}
         if len(cuts) > 1 or name in INCREMENTAL:
             return 0
         return min(rows // spec.chunk_rows, spec.chunk_count, source_spec.chunk_count)
@@ -246,12 +245,10 @@ class StoreBuild:
         For a build whose rows are all there. Raises `DiskFull`.
         """
         spec, files = group_attributes(self.part)["feature_spec"], self.files(KEYS)
-        given = list(rows)
-        proven = [
-            golden for golden in given if golden.key(spec) == files.read(golden.row, 1).tobytes()
-        ]
+        rows = list(rows)
+        proven = [row for row in rows if row.key(spec) == files.read(row.row, 1).tobytes()]
         write_golden(self.part, sorted(proven, key=lambda golden: golden.row))
-        return len(given) - len(proven)
+        return len(rows) - len(proven)
 
     def seal(self, *, keep: bool = False) -> None:
         """Check every row, write the trailers and put the store in its place.
@@ -292,7 +289,7 @@ class StoreBuild:
 
     def put_in_place(self, keep: bool = False) -> None:
         """The second half of `seal`: an instant."""
-        put_in_place(self.part, self.target, STORE, keep=keep)
+        put_in_place(self.target, keep)
 
     def close(self) -> None:
         """Close every file."""

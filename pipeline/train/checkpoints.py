@@ -10,8 +10,8 @@ from torch import Tensor, nn
 
 from pipeline.base.border import Document, Text
 from pipeline.base.differences import describe, differences
-from pipeline.base.durable import read_document, read_tensors, write_tensors, write_with_digest
 from pipeline.base.errors import CheckpointMismatch
+from pipeline.base.files import read_document, read_tensors, write_tensors, write_with_digest
 from pipeline.policy.checkpoint import load_policy
 from pipeline.policy.document import Sha256
 from pipeline.policy.normalization import Normalization

@@ -18,9 +18,16 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from pipeline.base.config import TrainHeadParams
-from pipeline.base.durable import disk_full_named, fresh
 from pipeline.base.errors import ConfigError
-from pipeline.base.ownership import REPORT, OutputKind, begins_with, claim, refuse_foreign
+from pipeline.base.files import (
+    REPORT,
+    OutputKind,
+    begins_with,
+    claim,
+    disk_full_named,
+    fresh,
+    refuse_foreign,
+)
 from pipeline.train.process_group import ProcessGroup
 from pipeline.train.progress import Pace
 

@@ -21,21 +21,19 @@ from pipeline.base.border import Document, Text
 from pipeline.base.channels import action_groups
 from pipeline.base.config import TrainHeadParams
 from pipeline.base.differences import differences
-from pipeline.base.durable import (
+from pipeline.base.errors import CheckpointIncomplete, CheckpointMismatch
+from pipeline.base.files import (
+    REPORT,
+    OutputKind,
+    begin_folder,
     put_in_place,
     read_document,
     recover,
     recover_folder,
-    write_with_digest,
-)
-from pipeline.base.errors import CheckpointIncomplete, CheckpointMismatch
-from pipeline.base.ownership import (
-    REPORT,
-    OutputKind,
-    begin_folder,
     refuse_foreign,
     remove_folder,
     unmark,
+    write_with_digest,
 )
 from pipeline.base.source import SourceDocument
 from pipeline.policy.checkpoint import CHECKPOINT, DOCUMENT, SOURCE_KEYS, check_policy
@@ -157,7 +155,7 @@ def open_run(
     output, identity = params.output, run_identity(params, store, extra_identity)
     part = _part(output)
     notes = []
-    recover(output, RUN_FOLDER)
+    recover(part, output, RUN_FOLDER)
     if (output / RUN).exists():
         another = read_document(output / RUN, RunDocument)[1] != identity
         if another or params.anew:

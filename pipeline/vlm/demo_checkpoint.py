@@ -19,8 +19,7 @@ from tokenizers import AddedToken, Regex, Tokenizer, decoders, normalizers, pre_
 from tokenizers.models import BPE
 from transformers import Qwen2_5_VLConfig, Qwen2_5_VLForConditionalGeneration
 
-from pipeline.base.durable import replace_folder
-from pipeline.base.ownership import OutputKind
+from pipeline.base.files import OutputKind, replace_folder
 from pipeline.vlm.checkpoint_folder import quiet_transformers
 
 _FILES = Path(__file__).with_name("demo")

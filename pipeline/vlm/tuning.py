@@ -12,8 +12,8 @@ from safetensors.torch import load_file
 from torch import Tensor, nn
 
 from pipeline.base.config import TuningParams, VLMParams
-from pipeline.base.durable import disk_full_named, sync, write_tensors
 from pipeline.base.errors import VLMError
+from pipeline.base.files import disk_full_named, sync, write_tensors
 from pipeline.vlm.checkpoint_folder import quiet_transformers, resolve_checkpoint
 from pipeline.vlm.loading import adapted, cut, load_checkpoint, load_whole
 from pipeline.vlm.slots import Slot

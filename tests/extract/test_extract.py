@@ -493,6 +493,23 @@ class TestWhatWouldBeLost:
         assert content(store) == whole
 
     @pytest.mark.usefixtures("extracted")
+    def test_an_interrupted_return_still_takes_the_rows_of_the_kept_store(
+        self, params, recordings, monkeypatch, counted
+    ):
+        def stop(*_: object) -> None:
+            raise KeyboardInterrupt
+
+        (recordings / "Press").rename(recordings.with_name("unmounted"))
+        run(params)
+        recordings.with_name("unmounted").rename(recordings / "Press")
+        with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+            patch.setattr(StoreBuild, "mark", stop)
+            run(params)
+        _, said = run(params)
+        assert any("continuing the interrupted build" in line for line in said)
+        assert not counted, "its rows were there"
+
+    @pytest.mark.usefixtures("extracted")
     def test_a_store_behind_a_link_is_kept_for_its_rows_as_it_is(
         self, params, recordings, tmp_path, counted
     ):

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from pipeline.base.errors import StoreMismatch
-from pipeline.extract.repair import carry_rows, copy_layout, layout_is_sound, put_in_place
+from pipeline.extract.repair import begin_from_store, layout_is_sound
 from pipeline.store import FeatureStore, StoreBuild, part_path, read_plan
 from pipeline.store.chunks import write_seal
 from pipeline.store.schema import chunk_paths, read_spec, read_specs
@@ -51,9 +51,7 @@ def repaired(store: Path) -> StoreBuild:
     """The build that `stages.extract` would find."""
     verification = verify(store, threads=1)
     assert layout_is_sound(verification)
-    build = copy_layout(store)
-    carry_rows(store, build, verification)
-    put_in_place(build, store)
+    begin_from_store(verification)
     return StoreBuild(store, read_specs(part_path(store)), read_plan(part_path(store)) or "")
 
 
@@ -156,9 +154,8 @@ def test_a_store_that_was_replaced_since_it_was_checked_gives_no_row(original, s
     verification = verify(store, threads=1)
     store.rename(store.with_name("before.zarr"))
     shutil.copytree(original, store)
-    build = copy_layout(store)
     with pytest.raises(StoreMismatch, match=r"another store took its place.*Run the same"):
-        carry_rows(store, build, verification)
+        begin_from_store(verification)
 
 
 class Killed(BaseException):

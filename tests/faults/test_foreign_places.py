@@ -8,11 +8,11 @@ from pathlib import Path
 import pytest
 import zarr
 
-from pipeline.base.ownership import MARKER, REPORT
+from pipeline.base.errors import ConfigError
+from pipeline.base.files import MARKER, REPORT, refuse_foreign
 from pipeline.store.archive import archive
 from pipeline.store.paths import STORE
 
-SPEED = "step\tsteps_per_s\tdata_wait_share\tpeak_memory_mib\ttrained_s"
 PRESS = 'data.sources=[{"name": "made", "path": "Press"}]'
 WRITERS: dict[str, tuple[str, str, tuple[str, ...]]] = {
     "extract": ("stages.extract", "x.zarr", ("extract.store={}",)),
@@ -24,7 +24,6 @@ WRITERS: dict[str, tuple[str, str, tuple[str, ...]]] = {
         "x.zarr.files.sqlite",
         ("extract.store={tmp}/x.zarr", "extract.plan=true"),
     ),
-    "replaced": ("stages.extract", "stores/made.zarr.replaced", ()),
     "lost": (
         "stages.extract",
         "stores/made.zarr.previous",
@@ -119,16 +118,9 @@ def test_a_marker_that_a_kill_cut_off_makes_no_folder_foreign(tmp_path: Path) ->
     assert not STORE.owns(tmp_path)
 
 
-def test_folders_of_nothing_are_no_reports(tmp_path: Path) -> None:
-    (tmp_path / "chapters" / "drafts").mkdir(parents=True)
-    (tmp_path / "pictures").mkdir()
-    assert not REPORT.owns(tmp_path)
-
-
-def test_logs_of_earlier_versions_are_known_by_the_speed_beside_them(tmp_path: Path) -> None:
-    logs, speed = tmp_path / "logs", tmp_path / "logs.speed.tsv"
-    (logs / "plots" / "metrics").mkdir(parents=True)
-    assert not REPORT.owns(logs)
-    for beside, ours in (("", False), ("step\tloss\n", False), (SPEED + "\n", True)):
-        speed.write_text(beside)
-        assert REPORT.owns(logs) == ours
+def test_a_folder_of_reports_is_known_by_its_marker_alone(tmp_path: Path) -> None:
+    (tmp_path / "report.html").write_text('<meta name="pictures" content="">')
+    with pytest.raises(ConfigError, match=r"Reports of earlier .* move or remove"):
+        refuse_foreign(tmp_path, REPORT)
+    (tmp_path / MARKER).write_text("a folder of reports\n")
+    refuse_foreign(tmp_path, REPORT)

@@ -14,13 +14,13 @@ import pytest
 import torch
 
 from pipeline.base.config import TrainHeadParams
-from pipeline.base.durable import (
+from pipeline.base.errors import CheckpointIncomplete, CheckpointMismatch
+from pipeline.base.files import (
     read_document,
     read_tensors,
     write_tensors,
     write_with_digest,
 )
-from pipeline.base.errors import CheckpointIncomplete, CheckpointMismatch
 from pipeline.base.tuned_on import EpisodePart
 from pipeline.policy.checkpoint import (
     PolicyCheckpoint,

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.base.durable import RUN_FILES
 from pipeline.base.errors import CheckpointIncomplete, NumericsError
+from pipeline.base.files import RUN_FILES
 from pipeline.policy.normalization import ChannelStatistics, Normalization, fit_channels
 
 

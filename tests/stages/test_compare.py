@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 import yaml
 
+from pipeline.base.files import MARKER
 from pipeline.evaluate.baselines import BASELINES
 from pipeline.evaluate.evaluation import JUDGED
 from pipeline.evaluate.experiments import read_experiments
@@ -83,7 +84,7 @@ def test_a_table_for_each_span_a_file_and_a_picture(
         assert lines[at + height].startswith(f"lowest test error of {span}: ")
     output = experiments.parent / "comparison"
     names = ["experiments.csv", "experiments.png", "report.html"]
-    assert sorted(path.name for path in output.iterdir()) == names
+    assert sorted(path.name for path in output.iterdir()) == [MARKER, *names]
     assert (output / "experiments.png").read_bytes().startswith(b"\x89PNG")
     rows = list(csv.DictReader((output / "experiments.csv").read_text().splitlines()))
     for row in rows:

@@ -10,6 +10,7 @@ import pytest
 import yaml
 import zarr
 
+from pipeline.base.files import MARKER
 from pipeline.store import FeatureStore
 from pipeline.store.chunks import write_seal
 from stages import probe
@@ -49,7 +50,7 @@ def test_a_ranking_files_and_pictures(params: Path, capsys: pytest.CaptureFixtur
     assert run("", probe.main, ["--params", str(params)]) == 0
     lines = capsys.readouterr().out.splitlines()
     report = params.parent / "report"
-    assert sorted(file.name for file in report.iterdir()) == FILES
+    assert sorted(file.name for file in report.iterdir()) == [MARKER, *FILES]
     # The action's first two channels are those of slot 0, which is the mean.
     assert [line.split("  ")[0] for line in lines[6:11]] == [
         "mean action",

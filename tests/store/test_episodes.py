@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from pipeline.store import FeatureStore
-from pipeline.store.episodes import SAID, EpisodeRows, episode_arrays
+from pipeline.store.episodes import FIELDS, EpisodeRows, episode_arrays
 
 REUSE = 3
 
@@ -49,7 +49,7 @@ class Ticks:
 
 @given(st.lists(st.tuples(st.integers(1, 12), st.integers(0, 40)), min_size=1, max_size=6))
 def test_their_arrays_agree_and_give_them_back(hold_together, counts):
-    said = [{name: f"{name} {at}, ü" for name in SAID} for at in range(len(counts))]
+    said = [{name: f"{name} {at}, ü" for name in FIELDS} for at in range(len(counts))]
     rows = [
         EpisodeRows(Ticks(ticks, readings), readings, readings, "ab"[at % 2], said[at])
         for at, (ticks, readings) in enumerate(counts)
@@ -68,5 +68,5 @@ def test_their_arrays_agree_and_give_them_back(hold_together, counts):
     store = FeatureStore(Path("nowhere"), attributes, arrays)
     hold_together(store)
     assert [(len(one.ticks), len(one.readings)) for one in store.episodes] == counts
-    assert [{name: getattr(one, name) for name in SAID} for one in store.episodes] == said
+    assert [{name: getattr(one, name) for name in FIELDS} for one in store.episodes] == said
     assert [one.source for one in store.episodes] == ["ab"[at % 2] for at in range(len(counts))]

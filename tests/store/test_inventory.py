@@ -10,9 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.base.durable import HELD, KEPT, previous_path
 from pipeline.base.errors import ConfigError, StoreLocked
-from pipeline.base.ownership import MARKER, begin_folder, mark
+from pipeline.base.files import HELD, MARKER, begin_folder, mark
 from pipeline.store import FeatureStore, StoreBuild, build_lock
 from pipeline.store.archive import archive
 from pipeline.store.inventory import (
@@ -24,7 +23,7 @@ from pipeline.store.inventory import (
     list_stores,
     remove_entry,
 )
-from pipeline.store.paths import STORE
+from pipeline.store.paths import KEPT, STORE, previous_path, set_build_aside
 from pipeline.store.schema import read_specs
 
 Make = Callable[..., Path]
@@ -217,6 +216,13 @@ class TestLeftovers:
             remove_entry(one)
         assert os.listdir(tmp_path) == ["tiny.zarr"]
 
+    def test_a_build_that_was_set_aside_is_work(self, tiny_store: Make, tmp_path: Path) -> None:
+        part = unfinish(tiny_store(tmp_path), 12)
+        set_build_aside(tmp_path / "tiny.zarr")
+        assert unneeded(tmp_path) == []
+        (line,) = describe_kept(list_stores(tmp_path))
+        assert line.startswith(f"{part}: unfinished build with ")
+
     def test_the_only_copy_of_a_store_is_never_removed(
         self, tiny_store: Make, tmp_path: Path
     ) -> None:
@@ -261,7 +267,7 @@ class TestLeftovers:
             (part / "zarr.json").unlink(missing_ok=True)
             raise KeyboardInterrupt
 
-        monkeypatch.setattr("pipeline.base.ownership.shutil.rmtree", killed)
+        monkeypatch.setattr("pipeline.base.files.shutil.rmtree", killed)
         with pytest.raises(KeyboardInterrupt):
             remove_entry(leftover)
         assert any(part.iterdir())
@@ -278,7 +284,7 @@ class TestLeftovers:
         def killed(path: Path) -> None:
             raise KeyboardInterrupt
 
-        monkeypatch.setattr("pipeline.base.ownership.shutil.rmtree", killed)
+        monkeypatch.setattr("pipeline.base.files.shutil.rmtree", killed)
         with pytest.raises(KeyboardInterrupt):
             remove_entry(leftover)
         assert KEPT.owns(kept)

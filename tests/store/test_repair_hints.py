@@ -16,12 +16,16 @@ def test_a_store_is_repaired_and_extracted_by_name(inside: str) -> None:
     assert ".part" not in said
 
 
-@pytest.mark.parametrize("name", ["a.zarr.part", "a.zarr.repair.part", "a.zarr.known-3"])
-def test_a_build_is_removed_and_begun_anew(name: str) -> None:
-    said = mend(Path("some", name, "vl/key/c/0/0"))
-    assert f"python -m stages.store gc some/{name} --remove" in said
+def test_a_build_is_removed_and_begun_anew() -> None:
+    said = mend(Path("some/a.zarr.part/vl/key/c/0/0"))
+    assert "python -m stages.store gc some/a.zarr.part --remove" in said
     assert said.endswith("python -m stages.extract --set extract.store=some/a.zarr.")
     assert "--repair" not in said
+
+
+def test_a_build_that_was_set_aside_is_removed_alone() -> None:
+    said = mend(Path("some/a.zarr.part/.known/3/vl/key/c/0/0"))
+    assert said.startswith("Remove some/a.zarr.part/.known/3, then run python -m stages.extract")
 
 
 def test_a_name_of_another_kind_is_taken_as_it_is() -> None:

@@ -8,6 +8,7 @@ import socket
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -17,9 +18,27 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from pipeline.base.errors import ConfigError, DiskFull, StoreIncomplete, StoreLocked
-from pipeline.store import FeatureStore, RowSource, Sizes, StoreBuild, arrays, build_lock, recover
+from pipeline.store import (
+    FeatureStore,
+    RowSource,
+    Sizes,
+    StoreBuild,
+    arrays,
+    build_lock,
+    part_path,
+    recover,
+)
 from pipeline.store.chunks import check_trailers, row_checksums
 from pipeline.store.lock import lock_holder
+from pipeline.store.paths import (
+    KEPT,
+    begin_build,
+    builds_aside,
+    is_store,
+    previous_path,
+    put_in_place,
+    set_build_aside,
+)
 from pipeline.store.schema import FEATURES, TRAILER_BYTES, ArraySpec
 from tests.store.samples import TEXT, attributes_of, index_of
 
@@ -52,6 +71,35 @@ def rows_of(seed: int, count: int) -> np.ndarray:
 
 class Killed(BaseException):
     """Stands for SIGKILL: nothing may catch it."""
+
+
+CHANGES = (
+    *((Path, name) for name in ("rename", "mkdir", "write_text", "unlink", "symlink_to")),
+    (shutil, "rmtree"),
+)
+"""Of a folder."""
+
+
+def killed_before(step: int, act: Callable[[], None], steps=CHANGES) -> bool:
+    """Whether `act` was killed before its n-th of these steps."""
+    count = iter(range(10**6))
+
+    def counted(real):
+        def call(*args, **kwargs):
+            if next(count) == step:
+                raise Killed
+            return real(*args, **kwargs)
+
+        return call
+
+    with pytest.MonkeyPatch.context() as patch:
+        for owner, name in steps:
+            patch.setattr(owner, name, counted(getattr(owner, name)))
+        try:
+            act()
+        except Killed:
+            return True
+    return False
 
 
 class TestCommit:
@@ -158,7 +206,7 @@ class TestSeal:
             if replaces:
                 self.full(folder, "before", seed=1).seal()
             build = self.full(folder, "after")
-            finished = self._sealed_before_kill(build, steps, kill_at)
+            finished = not killed_before(kill_at, build.seal, steps)
             if not finished:
                 recover(build.target)
                 if build.part.exists():
@@ -172,25 +220,87 @@ class TestSeal:
                 return
         raise AssertionError("sealing takes more steps than expected")
 
-    def _sealed_before_kill(self, build: StoreBuild, steps, kill_at: int) -> bool:
-        count = iter(range(10**6))
+    @pytest.mark.parametrize("linked", [False, True])
+    def test_a_kill_while_the_old_is_kept_is_mended_by_sealing_again(self, tmp_path, linked):
+        """Kill before the n-th change of the folders, for every n, until none is left."""
+        built = tmp_path / "built"
+        self.full(built, "before", seed=1).seal()
+        self.full(built, "after").finish()
+        for kill_at in range(30):
+            target = Path(shutil.copytree(built, tmp_path / str(kill_at))) / "s.zarr"
+            if linked:
+                target.rename(target.with_name("big"))
+                target.symlink_to("big")
+            finished = not killed_before(kill_at, lambda: put_in_place(target, keep=True))  # noqa: B023
+            recover(target)
+            if part_path(target).exists():
+                put_in_place(target, keep=True)
+            previous = previous_path(target)
+            for store, seed in ((target, 0), (previous, 1)):
+                assert np.array_equal(FeatureStore.open(store).array(FEATURES), rows_of(seed, ROWS))
+            assert KEPT.owns(previous)
+            assert previous.is_symlink() == linked
+            assert {path.name for path in target.parent.iterdir()} <= {
+                "s.zarr",
+                "s.zarr.previous",
+                "big",
+            }
+            assert sorted(os.listdir(target)) == sorted(os.listdir(built / "s.zarr"))
+            if finished:
+                assert kill_at >= 3
+                return
+        raise AssertionError("more steps than expected")
 
-        def counted(real):
-            def call(*args, **kwargs):
-                if next(count) == kill_at:
-                    raise Killed
-                return real(*args, **kwargs)
+    @pytest.mark.parametrize("link", [False, True])
+    def test_a_copy_or_link_of_the_user_is_not_the_one_that_was_kept(self, tmp_path, link):
+        self.full(tmp_path, "before", seed=1).seal()
+        self.full(tmp_path, "after").finish()
+        previous = previous_path(tmp_path / "s.zarr")
+        if link:
+            previous.symlink_to("s.zarr")
+        else:
+            shutil.copytree(tmp_path / "s.zarr", previous)
+        with pytest.raises(ConfigError, match=r"s\.zarr\.previous"):
+            put_in_place(tmp_path / "s.zarr", keep=True)
+        assert FeatureStore.open(tmp_path / "s.zarr").attrs["plan"] == "before"
+        put_in_place(tmp_path / "s.zarr")
+        assert previous.is_symlink() == link
+        assert previous.exists()
 
-            return call
+    def test_a_kill_at_any_step_of_setting_a_build_aside_keeps_its_rows(self, tmp_path):
+        build = begun(tmp_path / "begun")
+        build.commit([3], rows_of(0, 1), [bytes(16)], build.environment_index({"torch": "1"}))
+        build.close()
+        for kill_at in range(30):
+            folder = Path(shutil.copytree(tmp_path / "begun", tmp_path / str(kill_at)))
+            target = folder / "s.zarr"
+            finished = not killed_before(kill_at, lambda: set_build_aside(target))  # noqa: B023
+            recover(target)
+            (known,) = filter(is_store, [part_path(target), *builds_aside(target)])
+            row, environment = RowSource(known).take(bytes(16)) or (None, {})
+            assert np.array_equal(row, rows_of(0, 1)[0])
+            assert environment == {"torch": "1"}
+            begin_build(target)
+            assert not finished or [known] == builds_aside(target)
+            if finished:
+                assert kill_at > 6
+                return
+        raise AssertionError("more steps than expected")
 
-        with pytest.MonkeyPatch.context() as patch:
-            for owner, name in steps:
-                patch.setattr(owner, name, counted(getattr(owner, name)))
-            try:
-                build.seal()
-            except Killed:
-                return False
-        return True
+    def test_a_build_that_an_earlier_version_set_aside_is_taken_over(self, tmp_path):
+        begun(tmp_path).close()
+        target = tmp_path / "s.zarr"
+        part_path(target).rename(tmp_path / "s.zarr.known-0")
+        shutil.copytree(tmp_path / "s.zarr.known-0", tmp_path / "s.zarr.known-good")
+        recover(target)
+        assert sorted(os.listdir(tmp_path)) == ["s.zarr.known-good", "s.zarr.part"]
+        assert len(builds_aside(target)) == 1
+
+    @pytest.mark.parametrize("left", ["keeping", "repair.part"])
+    def test_what_an_earlier_version_left_is_named_with_what_to_do(self, tmp_path, left):
+        (tmp_path / f"s.zarr.{left}").mkdir()
+        with pytest.raises(ConfigError, match=rf"s\.zarr\.{left}: an earlier version.*[Rr]emove"):
+            recover(tmp_path / "s.zarr")
 
     def test_a_finished_store_replaced_is_never_written(self, tmp_path):
         self.full(tmp_path, "before", seed=1).seal()

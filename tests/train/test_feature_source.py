@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from pipeline.base.config import TrainHeadParams
-from pipeline.base.durable import read_document
+from pipeline.base.files import read_document
 from pipeline.policy.checkpoint import load_policy
 from pipeline.policy.policy import Policy, Trainable
 from pipeline.store import FeatureStore

@@ -12,9 +12,8 @@ from typing import Any
 import pytest
 
 from pipeline.base.config import TrainHeadParams
-from pipeline.base.durable import read_document, write_document
 from pipeline.base.errors import ConfigError, DiskFull
-from pipeline.base.ownership import MARKER
+from pipeline.base.files import MARKER, read_document, write_document
 from pipeline.store import FeatureStore
 from pipeline.train import log as loggers
 from pipeline.train.log import TrainingLog, check_loggers

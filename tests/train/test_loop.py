@@ -15,8 +15,8 @@ import pytest
 import torch
 
 from pipeline.base.config import TrainHeadParams
-from pipeline.base.durable import read_document
 from pipeline.base.errors import NumericsError, StoreIncomplete
+from pipeline.base.files import read_document
 from pipeline.policy.checkpoint import load_policy
 from pipeline.store import FeatureStore
 from pipeline.train.batches import Windows

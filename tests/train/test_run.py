@@ -9,9 +9,8 @@ from typing import Any
 
 import pytest
 
-from pipeline.base.durable import HELD, read_document
 from pipeline.base.errors import CheckpointIncomplete, CheckpointMismatch, ConfigError
-from pipeline.base.ownership import MARKER, begin_folder
+from pipeline.base.files import HELD, MARKER, begin_folder, read_document
 from pipeline.store import FeatureStore
 from pipeline.train.loop import Trainer
 from pipeline.train.run import RUN_FOLDER, TRAINER_VERSION, open_run

@@ -23,7 +23,7 @@ from matplotlib.image import AxesImage
 from matplotlib.ticker import NullFormatter, StrMethodFormatter
 from numpy.typing import NDArray
 
-from pipeline.base.durable import disk_full_named, fresh
+from pipeline.base.files import disk_full_named, fresh
 
 INK = "#333333"
 """Text, axes, and everything else that is black on white paper."""

@@ -16,9 +16,14 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup, escape
 from tqdm import tqdm
 
-from pipeline.base.durable import disk_full_named, sync
+from pipeline.base.files import (
+    OutputKind,
+    begin_folder,
+    disk_full_named,
+    remove_folder,
+    sync,
+)
 from pipeline.base.format import as_yaml
-from pipeline.base.ownership import REPORT, OutputKind, begin_folder, release, remove_folder
 from pipeline.look.page.blocks import Block, Issues, Picture, Report, Section
 from pipeline.look.page.issues import FINDINGS, findings_csv, group_issues, place_of, places_of
 from pipeline.look.page.style import NO_FONT, RC, boxes, write
@@ -63,7 +68,6 @@ def write_report(folder: Path, report: Report) -> list[Path]:
             return _put_in_place(temporary, folder, [*(f"{name}.png" for name in names), *texts])
         finally:
             remove_folder(temporary, _TEMPORARY)
-            release(folder, REPORT)
 
 
 def _put_in_place(temporary: Path, folder: Path, files: Sequence[str]) -> list[Path]:

@@ -10,8 +10,8 @@ import torch
 from pipeline.base.commands import command
 from pipeline.base.config import FinetuneParams, Params, TrainHeadParams, setting
 from pipeline.base.digests import file_digest
-from pipeline.base.durable import read_document, write_with_digest
 from pipeline.base.errors import ConfigError
+from pipeline.base.files import read_document, write_with_digest
 from pipeline.base.golden import GoldenRow
 from pipeline.base.tuned_on import TunedOn, joined, of_store, write_tuned_on
 from pipeline.policy.checkpoint import DOCUMENT

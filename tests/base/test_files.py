@@ -10,8 +10,11 @@ from pathlib import Path
 import pytest
 import torch
 
-from pipeline.base.durable import (
-    KEPT,
+from pipeline.base.errors import CheckpointIncomplete, DiskFull
+from pipeline.base.files import (
+    HELD,
+    OutputKind,
+    begin_folder,
     check_digest,
     fresh,
     put_in_place,
@@ -24,8 +27,6 @@ from pipeline.base.durable import (
     write_tensors,
     write_with_digest,
 )
-from pipeline.base.errors import CheckpointIncomplete, ConfigError, DiskFull
-from pipeline.base.ownership import OutputKind
 
 KIND = OutputKind("a folder of this test", lambda folder: (folder / "a").is_file())
 
@@ -61,7 +62,7 @@ def test_a_kill_between_any_two_steps_leaves_the_old_or_the_new(
 
     with monkeypatch.context() as patched:
         patched.setattr(Path, "rename", counted(Path.rename))
-        patched.setattr("pipeline.base.durable.sync", counted(lambda path: None))
+        patched.setattr("pipeline.base.files.sync", counted(lambda path: None))
         patched.setattr("shutil.rmtree", gone)
         with pytest.raises(Killed):
             put(folder, "new")
@@ -82,55 +83,28 @@ def test_a_link_of_the_user_beside_it_stays(tmp_path: Path, relative: bool) -> N
     assert (tmp_path / "last" / "a").read_text() == "new"
 
 
-@pytest.mark.parametrize("relative", [False, True])
-def test_of_a_link_the_folder_behind_it_is_kept_as_it_is(tmp_path: Path, relative: bool) -> None:
-    target, previous = tmp_path / "here" / "last", tmp_path / "here" / "last.previous"
-    put(tmp_path / "big" / "last", "old")
-    target.parent.mkdir()
-    target.symlink_to("../big/last" if relative else tmp_path / "big" / "last")
-    for text in ("new", "newer"):
-        complete = tmp_path / "here" / "complete"
-        complete.mkdir()
-        (complete / "a").write_text(text)
-        put_in_place(complete, target, KIND, keep=True)
-        assert (target / "a").read_text() == text
-        assert (previous / "a").read_text() == ("old" if text == "new" else "new")
-        assert KEPT.owns(previous)
-        assert previous.is_symlink() == (text == "new")
-        assert os.listdir(tmp_path / "big" / "last") == ["a"]
-    assert sorted(os.listdir(tmp_path / "here")) == ["last", "last.previous"]
-
-
 @pytest.mark.parametrize("linked", [False, True])
-def test_a_kill_while_the_old_is_kept_leaves_it_or_the_new_with_the_one_before(
+def test_a_kill_at_any_step_of_a_replacement_is_undone_or_completed(
     tmp_path: Path, linked: bool
 ) -> None:
     """Kill before the n-th change of the folder, for every n, until none is left."""
     for kill_at in range(40):
         here = tmp_path / str(kill_at)
-        target, previous, complete = (here / name for name in ("last", "last.previous", "complete"))
-        put(target, "older")
-        put(complete, "old")
-        put_in_place(complete, target, KIND, keep=True)
+        target, complete = here / "last", here / "complete"
+        put(target, "old")
         if linked:
             target.rename(here / "big")
             target.symlink_to("big")
         put(complete, "new")
-        keeping = partial(put_in_place, complete, target, KIND, keep=True)
-        finished = not killed_before(kill_at, keeping)
-        recover(target, KIND)
+        finished = not killed_before(kill_at, partial(put_in_place, complete, target, KIND))
+        recover(complete, target, KIND)
         now = (target / "a").read_text()
         assert not finished or now == "new"
-        assert (previous / "a").read_text() == {"new": "old", "old": "older"}[now]
-        assert KEPT.owns(previous)
-        assert {path.name for path in here.iterdir()} <= {
-            "last",
-            "last.previous",
-            "complete",
-            "big",
-        }
+        assert os.listdir(target) == ["a"]
+        assert {path.name for path in here.iterdir()} <= {"last", "complete", "big"}
+        assert not linked or (here / "big" / "a").read_text() == "old"
         if finished:
-            assert kill_at > 8
+            assert kill_at >= 4
             return
     raise AssertionError("more steps than expected")
 
@@ -157,14 +131,18 @@ def killed_before(step: int, act: Callable[[], None]) -> bool:
     return False
 
 
-def test_a_link_of_the_user_is_not_the_one_that_was_kept(tmp_path: Path) -> None:
-    put(tmp_path / "mine", "mine")
+@pytest.mark.parametrize("gone", [False, True])
+def test_what_an_earlier_version_was_killed_over_is_recovered(tmp_path: Path, gone: bool) -> None:
+    """It put the old folder into a marked one."""
     put(tmp_path / "last", "old")
-    put(tmp_path / "complete", "new")
-    (tmp_path / "last.previous").symlink_to("mine")
-    with pytest.raises(ConfigError, match=r"last\.previous"):
-        put_in_place(tmp_path / "complete", tmp_path / "last", KIND, keep=True)
-    assert (tmp_path / "last" / "a").read_text() == "old"
+    begin_folder(tmp_path / "last.replaced", HELD)
+    (tmp_path / "last").rename(tmp_path / "last.replaced" / "last")
+    if not gone:
+        put(tmp_path / "other", "new")
+        (tmp_path / "other").rename(tmp_path / "last")
+    recover(tmp_path / "last.new", tmp_path / "last", KIND)
+    assert (tmp_path / "last" / "a").read_text() == ("old" if gone else "new")
+    assert os.listdir(tmp_path) == ["last"]
 
 
 def test_a_failed_write_keeps_the_old(tmp_path: Path) -> None:

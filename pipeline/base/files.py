@@ -1,0 +1,362 @@
+"""Files and folders that survive a kill, and the marker that says which of them this project wrote.
+
+A file or folder is written beside its place, synced and renamed into it. Only what this project
+wrote is ever replaced or removed: a complete store or training says by itself what it is, every
+other folder holds `MARKER`, which is the first thing written into it and the last removed. An empty
+folder is anybody's.
+"""
+
+import errno
+import hashlib
+import json
+import os
+import shutil
+from collections.abc import Callable, Generator, Mapping
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
+
+from pydantic import JsonValue
+from safetensors import SafetensorError, safe_open
+
+from pipeline.base.border import MOST_WEIGHT, Border
+from pipeline.base.errors import CheckpointIncomplete, ConfigError, DiskFull
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+T = TypeVar("T")
+
+MARKER = ".vla-feature-cache"
+FULL = (errno.ENOSPC, errno.EDQUOT)
+DIGEST = "document_sha256"
+"""The key of a document's entry that holds the digest of all other entries."""
+RUN_FILES = Border(
+    CheckpointIncomplete,
+    "Copy it again, name another, or remove its folder and run the training that writes it "
+    "(stages.train_head or stages.finetune) again.",
+)
+"""How a damaged file of a training is refused."""
+_DOCUMENT = dict[str, JsonValue]
+_MOST_BYTES = 64 * 2**20
+"""Of a document: the normalisation of a wide policy's features takes 20 MB."""
+_MOST_WEIGHT = 2 * MOST_WEIGHT
+"""Of a document with its digest: 80,000 episodes weigh 4 million, a million steps' rows 5."""
+
+
+@dataclass(frozen=True)
+class OutputKind:
+    """A kind of output, by the line in its marker."""
+
+    name: str
+    """With its article, as an error calls it."""
+    is_one: Callable[[Path], bool] = lambda path: False
+    """Tells a complete one, which holds no marker."""
+    advice: str = ""
+    """What an error adds where something else lies there."""
+
+    def owns(self, path: Path) -> bool:
+        """Whether this project may replace what lies there as one of this kind."""
+        return self.is_one(path) or (path.is_dir() and (self.marks(path) or _is_empty(path)))
+
+    def marks(self, path: Path) -> bool:
+        """Whether it is marked as one of this kind."""
+        return _marked(path) == self.name
+
+
+def begins_with(line: str) -> Callable[[Path], bool]:
+    """Tells a file by the beginning of its first line; an empty file is anybody's."""
+
+    def begins(path: Path) -> bool:
+        if not path.is_file():
+            return False
+        with path.open(encoding="utf-8", errors="replace") as file:
+            return not (first := file.readline().strip()) or first.startswith(line)
+
+    return begins
+
+
+def there(path: Path) -> bool:
+    """Whether anything has this name, a link to nothing too."""
+    return path.exists() or path.is_symlink()
+
+
+def described(path: Path) -> str:
+    """What lies there, for an error."""
+    if not path.is_dir():
+        return "a file" if path.exists() else "a link to nothing"
+    names = sorted(entry.name for entry in path.iterdir())
+    if not names:
+        return "an empty folder"
+    return f"a folder with {', '.join(names[:3])}{' …' if len(names) > 3 else ''}"
+
+
+def refuse_foreign(path: Path, kind: OutputKind) -> None:
+    """Raise `ConfigError` where something lies at `path` that this project did not write."""
+    if there(path) and not kind.owns(path):
+        raise ConfigError(
+            f"{path}: expected nothing there or {kind.name} that this project wrote, found "
+            f"{described(path)}. It was left as it is: move it away, or name another place."
+            f"{kind.advice}"
+        )
+
+
+def remove_folder(path: Path, kind: OutputKind) -> None:
+    """Remove a folder of this kind, if there is one; of one behind a symbolic link, the link alone.
+
+    Files go before folders, so that what a kill leaves looks like nothing complete, and the marker
+    goes last. Raises `ConfigError` where it is not this project's.
+    """
+    refuse_foreign(path, kind)
+    if path.is_symlink():
+        path.unlink()
+    elif path.exists():
+        with suppress(OSError):  # on a full disk, where only a kill from here on would show
+            mark(path, kind)
+        _empty(path, MARKER)
+        shutil.rmtree(path)
+
+
+def begin_folder(path: Path, kind: OutputKind, but: str = MARKER) -> None:
+    """Make an empty, marked folder, in place of one of this kind; its entry `but` stays."""
+    if path.is_symlink():
+        remove_folder(path, kind)
+    claim(path, kind)
+    _empty(path, MARKER, but)
+
+
+def _empty(folder: Path, *but: str) -> None:
+    for entry in sorted(folder.iterdir(), key=Path.is_dir):
+        if entry.name not in but:
+            if entry.is_dir() and not entry.is_symlink():
+                shutil.rmtree(entry)
+            else:
+                entry.unlink()
+
+
+def claim(folder: Path, kind: OutputKind) -> None:
+    """Make a folder, or take one of this kind as it is, and mark it.
+
+    Raises `ConfigError` where it is not this project's.
+    """
+    refuse_foreign(folder, kind)
+    folder.mkdir(parents=True, exist_ok=True)
+    mark(folder, kind)
+
+
+def mark(folder: Path, kind: OutputKind) -> None:
+    """Write down that a folder is of this kind, unless it says so already."""
+    if _marked(folder) != kind.name:
+        unmark(folder)  # DVC may have linked it into its cache
+        (folder / MARKER).write_text(f"{kind.name}\n", encoding="utf-8")
+
+
+def unmark(folder: Path) -> None:
+    """Take the marker away from a folder that says by itself what it is."""
+    (folder / MARKER).unlink(missing_ok=True)
+
+
+def replace_folder(folder: Path, write: Callable[[Path], None], kind: OutputKind) -> None:
+    """Put what `write` writes into a temporary folder at `folder`, in place of what is there.
+
+    A kill leaves the old content or the new, as `put_in_place` does. Raises `DiskFull` with the old
+    in place, and `ConfigError` where something that is not of this kind lies there.
+    """
+    recover_folder(folder, kind)
+    temporary = _beside(folder, "new")
+    with disk_full_named(folder):
+        try:
+            begin_folder(temporary, kind)
+            write(temporary)
+            for file in temporary.iterdir():
+                sync(file)
+            sync(temporary)
+        except BaseException:
+            remove_folder(temporary, kind)
+            raise
+    put_in_place(temporary, folder, kind)
+
+
+def recover_folder(folder: Path, kind: OutputKind) -> None:
+    """Undo or complete a `replace_folder` that a kill stopped."""
+    temporary = _beside(folder, "new")
+    recover(temporary, folder, kind)
+    remove_folder(temporary, kind)
+
+
+def put_in_place(complete: Path, target: Path, kind: OutputKind) -> None:
+    """Rename a complete folder to `target` and remove what was there; of a link, the link alone.
+
+    A kill leaves the old one or the new: the old one moves into the complete folder, from where
+    `recover` brings it back. Raises `ConfigError` where the old one is not of this kind.
+    """
+    refuse_foreign(target, kind)
+    unmark(complete)
+    if there(target):
+        target.rename(complete / _REPLACED)
+    complete.rename(target)
+    sync(target.parent)
+    recover(complete, target, kind)
+
+
+def recover(complete: Path, target: Path, kind: OutputKind) -> None:
+    """Undo or complete a `put_in_place` that a kill stopped.
+
+    Raises `ConfigError` where what lies at `target` is not of this kind.
+    """
+    refuse_foreign(target, kind)
+    if there(complete / _REPLACED) and not there(target):
+        (complete / _REPLACED).rename(target)
+    if HELD.marks(earlier := _beside(target, "replaced")):
+        if there(earlier / target.name) and not there(target):
+            (earlier / target.name).rename(target)
+        remove_folder(earlier, HELD)
+    if (target / _REPLACED).is_symlink():
+        (target / _REPLACED).unlink()
+    remove_folder(target / _REPLACED, kind)
+
+
+REPORT = OutputKind(
+    "a folder of reports",
+    advice=f" (Reports of earlier versions hold no {MARKER}: move or remove these.)",
+)
+"""What evaluations, inspections, probes, comparisons and trainings show; it keeps its marker."""
+HELD = OutputKind("a folder that is being replaced,")
+"""What earlier versions put the old folder into, as `<name>.replaced`."""
+_REPLACED = ".replaced"
+
+
+def _is_empty(folder: Path) -> bool:
+    """Whether nothing is in it, or a marker alone that a kill cut off before its line."""
+    return all(entry.name == MARKER and not entry.stat().st_size for entry in folder.iterdir())
+
+
+def _marked(folder: Path) -> str | None:
+    """The kind that a folder is marked with."""
+    try:
+        return (folder / MARKER).read_text(encoding="utf-8", errors="replace").strip()
+    except (FileNotFoundError, NotADirectoryError):
+        return None
+
+
+@contextmanager
+def disk_full_named(place: Path) -> Generator[None]:
+    """Turn "no space left" and "quota exceeded" into `DiskFull` naming the place."""
+    try:
+        yield
+    except DiskFull:
+        raise
+    except (OSError, SafetensorError) as error:
+        # safetensors says the number in words only.
+        in_words = any(f"(os error {number})" in str(error) for number in FULL)
+        if not in_words and getattr(error, "errno", None) not in FULL:
+            raise
+        raise DiskFull(
+            f"{place}: no space left on the device ({free_bytes(place) / 2**20:.0f} MiB free). "
+            "What was complete before is kept: make room and run the same command again."
+        ) from error
+
+
+def free_bytes(path: Path) -> int:
+    """Bytes free on the file system that holds `path` or its nearest existing parent."""
+    while not path.exists():
+        path = path.parent
+    return shutil.disk_usage(path).free
+
+
+def fresh(path: Path) -> Path:
+    """The path, with nothing at it.
+
+    DVC restores files as hard links into its cache, so that writing into one would alter the
+    cache; a new file of the same name leaves it alone.
+    """
+    path.unlink(missing_ok=True)
+    return path
+
+
+def sync(path: Path) -> None:
+    """Wait until a file's content, or a folder's list of names, is on the disk."""
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def write_document(path: Path, document: Mapping[str, Any]) -> None:
+    """Write a JSON document, atomically; its floats come back to the bit. Raises `DiskFull`."""
+    temporary = _beside(path, "new")
+    text = json.dumps(document, indent=1, ensure_ascii=False, allow_nan=False)
+    with disk_full_named(path):
+        temporary.write_text(text + "\n", encoding="utf-8")
+        sync(temporary)
+    temporary.rename(path)
+
+
+def write_with_digest(path: Path, document: Mapping[str, Any]) -> None:
+    """As `write_document`, with a digest of the document in it, which reading checks."""
+    read = json.loads(json.dumps(document, allow_nan=False))  # where all keys are strings
+    write_document(path, {**document, DIGEST: _document_sha256(read)})
+
+
+def read_document(path: Path, model: type[T]) -> tuple[T, dict[str, Any]]:
+    """The JSON document at `path` as the model, and as a dictionary without its digest.
+
+    Raises `CheckpointIncomplete` where it is missing, is none, or is not what its digest is of.
+    """
+    text = RUN_FILES.read_bytes(path, _MOST_BYTES)
+    document = RUN_FILES.parse_json(text, _DOCUMENT, path, _MOST_WEIGHT)
+    digest = document.pop(DIGEST, None)
+    try:
+        altered = digest not in (None, _document_sha256(document))
+    except ValueError as error:
+        raise RUN_FILES.refusal(path, error) from None
+    if altered:
+        why = f"it was altered since it was written: its {DIGEST} is of another content"
+        raise RUN_FILES.refusal(path, why)
+    most = _MOST_WEIGHT if digest else MOST_WEIGHT
+    return RUN_FILES.parse_json(text, model, path, most), document
+
+
+def _document_sha256(document: Mapping[str, Any]) -> str:
+    canonical = json.dumps(document, sort_keys=True, separators=(",", ":"), allow_nan=False)
+    return hashlib.sha256(canonical.encode()).hexdigest()
+
+
+def write_tensors(path: Path, tensors: Mapping[str, "Tensor"]) -> str:
+    """Write tensors as safetensors and return the sha256 of the file."""
+    from safetensors.torch import save_file  # torch: most that write files here hold no tensor
+
+    save_file({name: value.detach().cpu().contiguous() for name, value in tensors.items()}, path)
+    # safetensors writes for the owner alone; other files have what the umask leaves.
+    path.chmod(path.parent.stat().st_mode & 0o666)
+    return sha256_of(path)
+
+
+def read_tensors(path: Path, sha256: str) -> "dict[str, Tensor]":
+    """The tensors at `path`; `CheckpointIncomplete` when they are not those that were written."""
+    from safetensors.torch import load_file
+
+    check_digest(path, sha256)
+    with RUN_FILES.foreign(path, "cannot be read"):
+        return load_file(path)
+
+
+def check_digest(path: Path, sha256: str) -> None:
+    """Raise `CheckpointIncomplete` where the file at `path` is not the one that was written."""
+    RUN_FILES.check_file(path)
+    with RUN_FILES.foreign(path, "cut off or damaged"), safe_open(path, "numpy"):
+        pass  # the head says how long the file is: none is read without an end
+    if sha256_of(path) != sha256:
+        raise RUN_FILES.refusal(path, "its sha256 is not the one written with it")
+
+
+def sha256_of(path: Path) -> str:
+    """The sha256 of a file."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def _beside(path: Path, suffix: str) -> Path:
+    return path.with_name(f"{path.name}.{suffix}")

@@ -1,0 +1,202 @@
+"""What lies at the places of a store, and so what a run does: its `BuildState`.
+
+    current   the store is of the run's plan: nothing is done
+    resume    the part is of the run's plan, and as it was laid out: its missing rows are filled in
+    new       a part is laid out, and its rows are filled in
+
+A part of another plan is set aside within the new one (`pipeline.store.paths`). Rows are taken by
+key from every store and build that is there; the rest is computed. A part of the plan of the store
+beside it is a repair, which lacks the rows that are damaged there.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import closing
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Literal
+
+from pipeline.base.differences import describe, differences
+from pipeline.base.errors import StoreIncomplete, StoreMismatch
+from pipeline.base.files import refuse_foreign, remove_folder
+from pipeline.data.episode import Embodiment
+from pipeline.extract.survey import Survey
+from pipeline.store import RowSource, StoreBuild, part_path, read_plan
+from pipeline.store.paths import KEPT, MERGED, builds_aside, previous_path, set_build_aside
+from pipeline.store.schema import read_specs
+
+BuildState = Literal["new", "resume", "current"]
+Say = Callable[[str], None]
+_SHOWN = 6
+"""Entries of a feature spec that a message lists."""
+
+
+class StorePlaces:
+    """What lies at the three places of a store.
+
+    `begun` and `finished` are the plans of the build and of the store, None where there is none.
+    `aside` are interrupted builds of other plans, `stores` the store and the previous one, where
+    they are there: a copy that a user made of the previous one is none.
+    """
+
+    def __init__(self, target: Path) -> None:
+        self.target, self.part, self.previous = target, part_path(target), previous_path(target)
+        self.begun, self.finished = read_plan(self.part), read_plan(target)
+        self.aside = builds_aside(target)
+        self.kept = KEPT.owns(self.previous) and read_plan(self.previous) is not None
+        self.stores = [target] * (self.finished is not None) + [self.previous] * self.kept
+
+    def state(self, plan: str) -> BuildState:
+        """What a run of this plan does."""
+        if self.begun == plan:
+            return "resume" if self.layout_damage is None else "new"
+        return "current" if self.finished == plan else "new"
+
+    @property
+    def repaired(self) -> bool:
+        """Whether a repair of the store has begun, in a part of its own plan."""
+        plans = {self.begun, *(read_plan(place) for place in self.aside)}
+        return self.finished is not None and self.finished in plans
+
+    @property
+    def known(self) -> list[Path]:
+        """The builds and stores whose rows a build takes, its own part left out.
+
+        Not the stores once a repair has begun: their damage must not come back.
+        """
+        return self.aside if self.repaired else [*self.aside, *self.stores]
+
+    @cached_property
+    def layout_damage(self) -> str | None:
+        """What is wrong with all but the feature rows of the build."""
+        with closing(self.begun_build()) as build:
+            return build.layout_damage()
+
+    def begun_build(self) -> StoreBuild:
+        """The unfinished build."""
+        return StoreBuild(self.target, read_specs(self.part), self.begun or "")
+
+    def set_build_aside(self, surveyed: Survey, say: Say) -> "StorePlaces":
+        """The places without the build; its rows stay known unless its feature spec is another."""
+        if self.begun is not None:
+            before = RowSource(self.part).attributes
+            if before.feature_spec.digest == surveyed.spec.digest:
+                set_build_aside(self.target)
+            for line in spec_differences(before.raw["feature_spec"], surveyed.spec.attrs()):
+                say(f"the unfinished build {self.part} is given up: {line}")
+        return StorePlaces(self.target)
+
+    def keeping_note(self, surveyed: Survey) -> list[str]:
+        """What becomes of the store and the previous one where the run lacks episodes of them.
+
+        Raises `ConfigError` where something else lies where the store would be kept.
+        """
+        lost, contents, lines = self._lost(surveyed), surveyed.contents, list[str]()
+        if lost and self.finished:
+            refuse_foreign(self.previous, KEPT)
+            lines.append(
+                f"{self.target} holds {lost}: it is kept as {self.previous} until the next "
+                "successful run, which takes their rows from it where they are there again"
+            )
+            contents |= set(_contents(self.target) or ())
+        if self.kept:
+            known = _contents(self.previous)
+            fate = "kept" if lost else "removed"
+            fate = "replaced by it" if lost and self.finished else fate
+            gone = "all its" if known is None else sum(content not in contents for content in known)
+            lines.append(
+                f"{self.previous} is {fate} when this run succeeds; {gone} episode(s) are only in "
+                "there"
+            )
+        return lines
+
+    def put_in_place(self, build: StoreBuild, surveyed: Survey, say: Say) -> None:
+        """Seal a build; keep the store before where it has episodes that the build lacks."""
+        keep = self._lost(surveyed) is not None
+        build.seal(keep=keep)
+        if keep:
+            say(f"{self.previous}: the store before, kept until the next successful run")
+        elif self.kept:
+            remove_folder(self.previous, KEPT)
+
+    def drop_previous(self, surveyed: Survey) -> None:
+        """Remove the previous store where a kill left it although all its episodes are here."""
+        if self.kept and {*(_contents(self.previous) or [""])} <= surveyed.contents:
+            remove_folder(self.previous, KEPT)
+
+    def _lost(self, surveyed: Survey) -> str | None:
+        """Which episodes of the store before are not in this run; None: all are."""
+        if not self.stores or read_plan(self.stores[0]) == surveyed.plan:
+            return None
+        if (known := _contents(self.stores[0])) is None:
+            return "episodes that cannot be read any more"
+        contents = surveyed.contents
+        lost = sum(content not in contents for content in known)
+        what = f"{lost} episode(s) that are not in this run (or whose files are read otherwise now)"
+        return what if lost else None
+
+    def refuse_to_lose(self, surveyed: Survey, embodiment: Embodiment) -> None:
+        """Raise `StoreMismatch` where rows would be lost that these params cannot give again.
+
+        Those of a merged store, or one under repair, with recordings that params do not name: who
+        follows the advice of a check may run under other params than that store's own. And those of
+        a store or build without an episode in common, of another embodiment or other sources only.
+        """
+        under_repair = self.finished is not None and self.finished == self.begun
+        # A store under repair may be one whose metadata are damaged: its build says what it holds.
+        target = None if under_repair else self.finished
+        for place, plan in ((self.target, target), (self.part, self.begun)):
+            if plan is not None:
+                _refuse_another(RowSource(place), surveyed, embodiment)
+        if not under_repair and not (self.finished or "").startswith(MERGED):
+            return
+        source = RowSource(self.part if under_repair else self.target)
+        if lost := {text.content for text in source.texts} - surveyed.contents:
+            what = "is under repair" if under_repair else "was merged of others"
+            raise StoreMismatch(
+                f"{self.target}: {what} and holds {len(lost)} episode(s) that the params do not "
+                "name. Give the --params it was made with (or run its merge again), name another "
+                "extract.store, or move it away."
+            )
+
+
+def row_sources(places: Sequence[Path], surveyed: Survey) -> list[RowSource]:
+    """The stores and laid-out builds of the same feature spec among these."""
+    digest, sources = surveyed.spec.digest, map(RowSource, places)
+    return [source for source in sources if source.attributes.feature_spec.digest == digest]
+
+
+def _refuse_another(source: RowSource, surveyed: Survey, embodiment: Embodiment) -> None:
+    known = {text.content for text in source.texts}
+    if not known or known & surveyed.contents or not source.rows:
+        return
+    there, here = source.attributes.sources, sorted({r.source for r in surveyed.recordings})
+    streams, now = source.attributes.raw["streams"], embodiment.document()
+    both = [name for name in now if streams[name]["names"] and now[name]["names"]]
+    apart = differences({name: streams[name] for name in both}, {name: now[name] for name in both})
+    differing = [f"; {line}" for line in describe(apart)]
+    if differing or not set(there) & set(here):
+        raise StoreMismatch(
+            f"{source.path}: holds the feature rows of {len(known)} episode(s), none of which is "
+            "in data.sources, and extraction would throw them away (sources: "
+            f"{', '.join(there)} there, {', '.join(here)} here{''.join(differing)}).\n"
+            "Name another extract.store, give the --params it was made with, or move it away."
+        )
+
+
+def _contents(store: Path) -> list[str] | None:
+    """The content digest of each episode; None where they can no longer be read."""
+    try:
+        return [text.content for text in RowSource(store).texts]
+    except StoreIncomplete:
+        return None
+
+
+def spec_differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
+    """What differs between two feature specs, without all that follows from it."""
+    differing = differences(before, now)
+    first = {
+        place: values
+        for place, values in differing.items()
+        if not place.startswith(("slots", "example_prompt"))
+    }
+    return describe(first or differing)[:_SHOWN]
