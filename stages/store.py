@@ -12,8 +12,18 @@
 list and gc without --remove write nothing. Next after a merge: python -m stages.verify
 """
 
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
 from stages.command import Shorthand, run
 
+if TYPE_CHECKING:
+    from pipeline.base.config import Params, StoresParams
+    from pipeline.base.errors import PipelineError
+    from pipeline.store.admin import Inventory, Leftover
+
+SECTIONS = ("stores",)
 SHORTHANDS = (
     Shorthand("action", "stores.action", "list, merge or gc", "ACTION", "?"),
     Shorthand(
@@ -27,33 +37,8 @@ SHORTHANDS = (
     Shorthand("--remove", "stores.remove", "gc removes what it lists"),
 )
 
-if __name__ == "__main__":  # here, for --help waits for no import below
-    raise SystemExit(
-        run(__doc__ or "", "stages.store", shorthands=SHORTHANDS, sections=("stores",))
-    )
 
-import sys
-from pathlib import Path
-
-from pipeline.base.config import Params, StoresParams
-from pipeline.base.errors import ConfigError, PipelineError, StoreLocked
-from pipeline.base.format import size
-from pipeline.store import FeatureStore
-from pipeline.store.admin import (
-    Inventory,
-    Leftover,
-    describe_inventory,
-    describe_kept,
-    find_leftovers,
-    find_named,
-    remove_leftover,
-    take_inventory,
-)
-from pipeline.store.merging import merge
-from pipeline.train.run import find_trained
-
-
-def main(params: Params) -> None:
+def main(params: "Params") -> None:
     """Do what `stores.action` says."""
     match params.stores.action:
         case "list":
@@ -64,7 +49,10 @@ def main(params: Params) -> None:
             _gc(params.stores)
 
 
-def _list(params: StoresParams) -> None:
+def _list(params: "StoresParams") -> None:
+    from pipeline.base.errors import ConfigError
+    from pipeline.store.admin import describe_inventory, take_inventory
+
     if params.inputs:
         raise ConfigError(
             f"stores.inputs: list takes no paths, found {', '.join(map(str, params.inputs))}. It "
@@ -74,8 +62,11 @@ def _list(params: StoresParams) -> None:
     print(*describe_inventory(inventory, _dependents(inventory, params)), sep="\n")
 
 
-def _dependents(inventory: Inventory, params: StoresParams) -> dict[Path, list[str]]:
+def _dependents(inventory: "Inventory", params: "StoresParams") -> dict[Path, list[str]]:
     """What trained policies say of each store; those that say nothing readable go to stderr."""
+    from pipeline.store import FeatureStore
+    from pipeline.train.run import find_trained
+
     trained = find_trained(params.checkpoints)
     for policy in trained:
         if policy.damage:
@@ -89,7 +80,9 @@ def _dependents(inventory: Inventory, params: StoresParams) -> dict[Path, list[s
     return dependents
 
 
-def _merge(params: StoresParams) -> None:
+def _merge(params: "StoresParams") -> None:
+    from pipeline.store.merging import merge
+
     merged = merge(params.inputs, params.output)
     if merged is not None:
         print(
@@ -98,7 +91,11 @@ def _merge(params: StoresParams) -> None:
         )
 
 
-def _gc(params: StoresParams) -> None:
+def _gc(params: "StoresParams") -> None:
+    from pipeline.base.errors import StoreLocked
+    from pipeline.base.format import size
+    from pipeline.store.admin import remove_leftover
+
     leftovers = _selected(params) if params.inputs else _unneeded(params)
     done: list[Leftover] = []
     locked: list[PipelineError] = []
@@ -121,15 +118,19 @@ def _gc(params: StoresParams) -> None:
         raise locked[0]
 
 
-def _unneeded(params: StoresParams) -> list[Leftover]:
+def _unneeded(params: "StoresParams") -> "list[Leftover]":
+    from pipeline.store.admin import describe_kept, find_leftovers, take_inventory
+
     inventory = take_inventory(params.folder)
     for line in describe_kept(inventory):
         print(f"kept: {line}")
     return find_leftovers(inventory)
 
 
-def _selected(params: StoresParams) -> list[Leftover]:
+def _selected(params: "StoresParams") -> "list[Leftover]":
     """What is named, wherever it lies; only what lies beside it is looked at."""
+    from pipeline.store.admin import find_named, take_inventory
+
     by_folder: dict[Path, list[Path]] = {}
     for path in params.inputs:
         by_folder.setdefault(path.parent, []).append(path)
@@ -138,3 +139,7 @@ def _selected(params: StoresParams) -> list[Leftover]:
         for folder, paths in by_folder.items()
         for leftover in find_named(take_inventory(folder, subfolders=False), paths)
     ]
+
+
+if __name__ == "__main__":
+    raise SystemExit(run(__doc__ or "", main, shorthands=SHORTHANDS, sections=SECTIONS))
