@@ -11,26 +11,25 @@ what is damaged in an archive is named and never restored.
                                                  copy.zarr from the archive a.zarr
 """
 
-from stages.command import Shorthand, run
-
-RESTORE = Shorthand("--restore", "archive.restore", "make the store from its archive")
-
-if __name__ == "__main__":  # here, for --help waits for no import below
-    raise SystemExit(
-        run(__doc__ or "", "stages.archive", shorthands=[RESTORE], sections=("archive",))
-    )
-
 import time
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from pipeline.base.config import Params
-from pipeline.base.errors import ConfigError
-from pipeline.base.table import Table
-from pipeline.store.archive import Manifest, archive, restore
+from stages.command import Shorthand, run
+
+if TYPE_CHECKING:
+    from pipeline.base.config import Params
+    from pipeline.base.table import Table
+    from pipeline.store.archive import Manifest
+
+SECTIONS = ("archive",)
+SHORTHANDS = (Shorthand("--restore", "archive.restore", "make the store from its archive"),)
 
 
-def main(params: Params) -> None:
+def main(params: "Params") -> None:
     """Archive or restore, and report."""
+    from pipeline.store.archive import archive, restore
+
     store, output = _places(params)
     begun = time.perf_counter()
     if params.archive.restore:
@@ -50,8 +49,10 @@ def main(params: Params) -> None:
     )
 
 
-def _table(manifest: Manifest) -> Table:
+def _table(manifest: "Manifest") -> "Table":
     """Each array: size, how much smaller it became, codec."""
+    from pipeline.base.table import Table
+
     sizes = [
         (name, array.raw_bytes, sum(array.shard_bytes), array.codec)
         for name, array in manifest.arrays.items()
@@ -63,8 +64,10 @@ def _table(manifest: Manifest) -> Table:
     return Table(("array", "MB", "ratio", "codec"), rows)
 
 
-def _places(params: Params) -> tuple[Path, Path]:
+def _places(params: "Params") -> tuple[Path, Path]:
     """The store and its archive."""
+    from pipeline.base.errors import ConfigError
+
     store = params.archive.store or params.extract.store
     output = params.archive.output or store.with_name(f"{store.stem}.archive.zarr")
     if output.suffix != ".zarr":
@@ -78,3 +81,7 @@ def _places(params: Params) -> tuple[Path, Path]:
             "place, or set it to null for one beside the store."
         )
     return store, output
+
+
+if __name__ == "__main__":
+    raise SystemExit(run(__doc__ or "", main, shorthands=SHORTHANDS, sections=SECTIONS))

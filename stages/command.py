@@ -1,46 +1,23 @@
 """What every command shares: its options, its exit codes, a clean stop."""
 
-import os
-import signal
-import sys
-from types import FrameType
-
-STOPPED = "stopped; run the same command again"
-
-
-def _stop_at_once(signum: int, frame: FrameType | None) -> None:
-    """End without a traceback: while a command imports, it has begun nothing."""
-    os.write(2, f"{STOPPED}\n".encode())
-    os._exit(1)
-
-
-def _stop_without_traceback() -> None:
-    """Where this process is a command: until its work begins, which `_catch_signals` says.
-
-    What a shell or nohup has told to be ignored stays so.
-    """
-    running = getattr(sys.modules["__main__"], "__spec__", None)
-    if running is not None and running.name.startswith("stages."):
-        for number in (signal.SIGINT, signal.SIGTERM):
-            if signal.getsignal(number) in (signal.default_int_handler, signal.SIG_DFL):
-                signal.signal(number, _stop_at_once)
-
-
-_stop_without_traceback()  # here, for what is imported below takes a while
-
 import argparse
 import json
+import os
 import re
 import select
-from collections.abc import Callable, Sequence
+import signal
+import sys
+from collections.abc import Callable, Generator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
-from importlib import import_module
 from pathlib import Path
-from typing import Any
+from types import FrameType
+from typing import TYPE_CHECKING, Any
 
-from pipeline.base.commands import DEFAULT_PARAMS, running_with
-from pipeline.base.config import Params, described_keys, load_params
-from pipeline.base.errors import PipelineError
+if TYPE_CHECKING:
+    from pipeline.base.config import Params
+
+STOPPED = "stopped; run the same command again"
 
 
 @dataclass(frozen=True)
@@ -80,30 +57,51 @@ class Shorthand:
 
 def run(
     summary: str,
-    work: Callable[[Params], None] | str,
+    work: "Callable[[Params], None]",
     arguments: Sequence[str] | None = None,
     shorthands: Sequence[Shorthand] = (),
     sections: Sequence[str] = (),
+    prog: str | None = None,
 ) -> int:
     """Parse the options, do the work, return the exit code.
 
     0 done; 2 something the user can mend, said in one message without a traceback; 1 stopped by
     Ctrl-C or SIGTERM, by a reader of the output that has gone (`| head`), or by a bug, which keeps
-    its traceback. `work` may name a module whose `main` it is: it is imported, which takes seconds,
-    once options and params are known to be good. `sections` are those of params.yaml that `--keys`
-    lists.
+    its traceback. `--help` imports nothing; `work` imports what takes seconds itself. `sections`
+    are those of params.yaml that `--keys` lists.
     """
-    options = _parse(summary, arguments, shorthands, sections)
+    signalled: list[int] = []
+    with _stopped_by_signals(signalled):
+        try:
+            options = parser_of(summary, shorthands, sections, prog).parse_args(arguments)
+            return _run(work, options, shorthands, sections)
+        except (KeyboardInterrupt, ImportError) as error:
+            # An interrupted import may end as an ImportError.
+            if isinstance(error, ImportError) and not signalled:
+                raise
+            print(STOPPED, file=sys.stderr)
+            return 1
+
+
+def _run(
+    work: "Callable[[Params], None]",
+    options: argparse.Namespace,
+    shorthands: Sequence[Shorthand],
+    sections: Sequence[str],
+) -> int:
+    """`run` with its options parsed."""
+    from pipeline.base.commands import running_with
+    from pipeline.base.config import Params, described_keys, load_params
+    from pipeline.base.errors import PipelineError
+
     try:
         if options.keys:
             print("\n".join(described_keys(sections or tuple(Params.model_fields))))
         else:
             given = (one for each in shorthands for one in each.override(options))
             params = load_params(options.params, [*options.overrides, *given])
-            main = import_module(work).main if isinstance(work, str) else work
-            _catch_signals()
             with running_with(options.params, options.overrides):
-                main(params)
+                work(params)
         sys.stdout.flush()  # not at the interpreter's exit, where an error is said in any case
     except PipelineError as error:
         return _refuse(str(error))
@@ -115,23 +113,43 @@ def run(
         place = f"{error.filename}: " if error.filename else ""
         said = f"{place}{error.strerror or error}. Look at that path, then run the same again."
         return _refuse(said)
-    except KeyboardInterrupt:
-        print(STOPPED, file=sys.stderr)
-        return 1
     return 0
 
 
-def _parse(
+@contextmanager
+def _stopped_by_signals(signalled: list[int]) -> Generator[None]:
+    """Ctrl-C and SIGTERM stop through every `finally`, and are noted.
+
+    A signal that a shell or nohup has set to be ignored stays ignored.
+    """
+
+    def stop(signum: int, frame: FrameType | None) -> None:
+        signalled.append(signum)
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)  # no second one may cut a `finally`
+        raise KeyboardInterrupt
+
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    for number, handler in before.items():
+        if handler is not signal.SIG_IGN:
+            signal.signal(number, stop)
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def parser_of(
     summary: str,
-    arguments: Sequence[str] | None,
     shorthands: Sequence[Shorthand],
     sections: Sequence[str],
-) -> argparse.Namespace:
+    prog: str | None = None,
+) -> argparse.ArgumentParser:
     """The options of a command."""
     parser = argparse.ArgumentParser(
-        description=summary, formatter_class=argparse.RawDescriptionHelpFormatter
+        prog=prog, description=summary, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--params", type=Path, default=DEFAULT_PARAMS, metavar="FILE")
+    parser.add_argument("--params", type=Path, default=Path("params.yaml"), metavar="FILE")
     parser.add_argument(
         "--set",
         action="append",
@@ -147,7 +165,7 @@ def _parse(
     )
     for shorthand in shorthands:
         shorthand.add_to(parser)
-    return parser.parse_args(arguments)
+    return parser
 
 
 def _refuse(said: str) -> int:
@@ -161,16 +179,3 @@ def _is_unread() -> bool:
     for stream in (sys.stdout, sys.stderr):
         poll.register(stream, 0)
     return bool(poll.poll(0))
-
-
-def _catch_signals() -> None:
-    """From here on Ctrl-C and SIGTERM stop through every `finally`."""
-    if signal.getsignal(signal.SIGINT) is _stop_at_once:
-        signal.signal(signal.SIGINT, signal.default_int_handler)
-    signal.signal(signal.SIGTERM, _terminate)
-
-
-def _terminate(signum: int, frame: FrameType | None) -> None:
-    """Make SIGTERM stop as Ctrl-C does, through every `finally`, which no second one may cut."""
-    signal.signal(signal.SIGTERM, signal.SIG_IGN)
-    raise KeyboardInterrupt

@@ -11,28 +11,30 @@ not write is refused.
 Next: python -m stages.inspect (look at them), stages.extract (the store)
 """
 
+from pathlib import Path
+from typing import TYPE_CHECKING
+
 from stages.command import run
 
-if __name__ == "__main__":  # here, for --help waits for no import below
-    raise SystemExit(run(__doc__ or "", "stages.demo", sections=("demo",)))
+if TYPE_CHECKING:
+    from pipeline.base.config import Params
 
-from pathlib import Path
-
-from pipeline.base.config import Params
-from pipeline.base.files import recover_folder, replace_folder, write_document
-from pipeline.simulation.demo_recordings import (
-    DEMO,
-    MARKER,
-    contents_digest,
-    refuse_changed_checkpoint,
-    refuse_foreign,
-    write_demo_recordings,
-)
-from pipeline.vlm.demo_checkpoint import write_demo_checkpoint
+SECTIONS = ("demo",)
 
 
-def main(params: Params) -> None:
+def main(params: "Params") -> None:
     """The recordings under `demo.recordings`, the checkpoint at `demo.checkpoint`."""
+    from pipeline.base.files import recover_folder, replace_folder, write_document
+    from pipeline.simulation.demo_recordings import (
+        DEMO,
+        MARKER,
+        contents_digest,
+        refuse_changed_checkpoint,
+        refuse_foreign,
+        write_demo_recordings,
+    )
+    from pipeline.vlm.demo_checkpoint import write_demo_checkpoint
+
     demo = params.demo
     refuse_foreign(demo.checkpoint, "demo.checkpoint")
     recover_folder(demo.checkpoint, DEMO)
@@ -46,3 +48,7 @@ def main(params: Params) -> None:
     refuse_changed_checkpoint(demo.checkpoint)
     replace_folder(demo.checkpoint, write_marked, DEMO)
     print(f"{demo.episodes} episodes a format in {demo.recordings}, checkpoint {demo.checkpoint}")
+
+
+if __name__ == "__main__":
+    raise SystemExit(run(__doc__ or "", main, sections=SECTIONS))

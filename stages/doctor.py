@@ -15,22 +15,23 @@ extract.plan=true. What DVC has and how it links: dvc doctor.
 Exit code 2 where something is missing. Next: python -m stages.extract --set extract.plan=true
 """
 
+from typing import TYPE_CHECKING
+
 from stages.command import run
 
-if __name__ == "__main__":  # here, for --help waits for no import below
-    raise SystemExit(
-        run(__doc__ or "", "stages.doctor", sections=("data", "vlm", "extract", "train_head"))
-    )
+if TYPE_CHECKING:
+    from pipeline.base.config import Params
+    from pipeline.base.issue import Issue
 
-from pipeline.base.commands import command
-from pipeline.base.config import Params
-from pipeline.base.errors import PipelineError
-from pipeline.base.issue import Issue
-from pipeline.look.doctor import describe, examine
+SECTIONS = ("data", "vlm", "extract", "train_head")
 
 
-def main(params: Params) -> None:
+def main(params: "Params") -> None:
     """Print every group of issues; refuse where something is missing."""
+    from pipeline.base.commands import command
+    from pipeline.base.errors import PipelineError
+    from pipeline.look.doctor import describe, examine
+
     lacking: list[Issue] = []
     for title, issues in examine(params):
         print("\n".join(describe(title, issues)), flush=True)
@@ -45,3 +46,7 @@ def main(params: Params) -> None:
         f"nothing that was looked at is missing; {command('extract', '--set extract.plan=true')} "
         "reads every episode"
     )
+
+
+if __name__ == "__main__":
+    raise SystemExit(run(__doc__ or "", main, sections=SECTIONS))

@@ -7,29 +7,30 @@ Writes metrics.json, tables (CSV) and a page with its pictures (report.html, PNG
 best and the worst episode where their recordings still lie below `data.root`.
 """
 
-from stages.command import run
-
-if __name__ == "__main__":  # here, for --help waits for no import below
-    raise SystemExit(run(__doc__ or "", "stages.evaluate", sections=("evaluate",)))
-
 import os
 from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from pipeline.base.config import Params
-from pipeline.base.device import resolve_device
-from pipeline.base.files import REPORT, claim, refuse_foreign, write_document
-from pipeline.evaluate.evaluation import JUDGED, Evaluation, evaluate_checkpoint
-from pipeline.evaluate.tables import ablation_text, error_text, write_tables
-from pipeline.look.evaluation import evaluation_report
-from pipeline.look.page.writing import PAGE, write_report
-from pipeline.policy.checkpoint import PolicyCheckpoint, find_policy, load_policy
-from pipeline.store import FeatureStore, check_trailers
-from pipeline.train.training_data import check_store
+from stages.command import run
+
+if TYPE_CHECKING:
+    from pipeline.base.config import Params
+    from pipeline.evaluate.evaluation import Evaluation
+    from pipeline.policy.checkpoint import PolicyCheckpoint
+    from pipeline.store import FeatureStore
+
+SECTIONS = ("evaluate",)
 
 
-def main(params: Params) -> None:
+def main(params: "Params") -> None:
     """Evaluate the checkpoint that `evaluate` names, else what `train_head` wrote."""
+    from pipeline.base.device import resolve_device
+    from pipeline.base.files import REPORT, refuse_foreign
+    from pipeline.evaluate.evaluation import evaluate_checkpoint
+    from pipeline.evaluate.tables import ablation_text, error_text
+    from pipeline.policy.checkpoint import find_policy, load_policy
+
     refuse_foreign(params.evaluate.output, REPORT)
     folder = params.evaluate.checkpoint or params.train_head.output
     checkpoint = load_policy(find_policy(folder))
@@ -47,8 +48,11 @@ def main(params: Params) -> None:
     print(f"{params.evaluate.output}: {', '.join(file.name for file in files)}")
 
 
-def _store_for(checkpoint: PolicyCheckpoint, params: Params) -> FeatureStore:
+def _store_for(checkpoint: "PolicyCheckpoint", params: "Params") -> "FeatureStore":
     """The store that is named, or else trained from, which this policy fits."""
+    from pipeline.store import FeatureStore, check_trailers
+    from pipeline.train.training_data import check_store
+
     path = params.evaluate.store or params.train_head.store or params.extract.store
     store = FeatureStore.open(path)
     check_store(checkpoint, store)
@@ -57,11 +61,13 @@ def _store_for(checkpoint: PolicyCheckpoint, params: Params) -> FeatureStore:
     return store
 
 
-def _rollouts_page(params: Params) -> str:
+def _rollouts_page(params: "Params") -> str:
     """Where stages.rollout puts the page of this policy, seen from here; empty where it does not.
 
     By the params alone: dvc repro runs it after this stage.
     """
+    from pipeline.look.page.writing import PAGE
+
     judged, rolled_out = (
         section.checkpoint or params.train_head.output
         for section in (params.evaluate, params.rollout)
@@ -70,10 +76,20 @@ def _rollouts_page(params: Params) -> str:
     return page if judged == rolled_out and params.rollout.environment else ""
 
 
-def _write(folder: Path, evaluation: Evaluation, rollouts: str) -> list[Path]:
+def _write(folder: Path, evaluation: "Evaluation", rollouts: str) -> list[Path]:
     """The tables, the page with its pictures, and what was evaluated; returns their paths."""
+    from pipeline.base.files import REPORT, claim, write_document
+    from pipeline.evaluate.evaluation import JUDGED
+    from pipeline.evaluate.tables import write_tables
+    from pipeline.look.evaluation import evaluation_report
+    from pipeline.look.page.writing import write_report
+
     claim(folder, REPORT)
     files = write_tables(folder, evaluation)
     write_document(folder / JUDGED, evaluation.judged)
     report = evaluation_report(evaluation, rollouts)
     return [*files, folder / JUDGED, *write_report(folder, report)]
+
+
+if __name__ == "__main__":
+    raise SystemExit(run(__doc__ or "", main, sections=SECTIONS))

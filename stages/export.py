@@ -9,21 +9,23 @@ is from the policy. A file that is too far is refused, and what was there before
   python -m stages.export --set export.formats=[torch]         without ONNX's packages
 """
 
+from functools import partial
+from typing import TYPE_CHECKING
+
 from stages.command import run
 
-if __name__ == "__main__":  # here, for --help waits for no import below
-    raise SystemExit(run(__doc__ or "", "stages.export", sections=("export",)))
+if TYPE_CHECKING:
+    from pipeline.base.config import Params
 
-from functools import partial
-
-from pipeline.base.config import Params
-from pipeline.base.files import refuse_foreign
-from pipeline.policy.checkpoint import find_policy, load_policy
-from pipeline.robot.export import EXPORT, RECEIPT, export_head
+SECTIONS = ("export",)
 
 
-def main(params: Params) -> None:
+def main(params: "Params") -> None:
     """Export the checkpoint that `export` names, else what `train_head` wrote."""
+    from pipeline.base.files import refuse_foreign
+    from pipeline.policy.checkpoint import find_policy, load_policy
+    from pipeline.robot.export import EXPORT, RECEIPT, export_head
+
     wanted, say = params.export, partial(print, flush=True)
     refuse_foreign(wanted.output, EXPORT)
     folder = wanted.checkpoint or params.train_head.output
@@ -33,3 +35,7 @@ def main(params: Params) -> None:
         off = ", ".join(f"{found['std']:.1e} ({of})" for of, found in file["deviation"].items())
         say(f"{name}: {file['bytes'] / 1e6:.1f} MB, at most {off} training std off the policy")
     say(f"{wanted.output}: {', '.join(receipt['files'])}, {RECEIPT}")
+
+
+if __name__ == "__main__":
+    raise SystemExit(run(__doc__ or "", main, sections=SECTIONS))

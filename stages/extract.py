@@ -23,17 +23,20 @@ changed; added recordings compute only their rows; extract.batch_size and worker
 Next: python -m stages.inspect STORE (look at it), stages.train_head (train). docs/ says the rest.
 """
 
+from typing import TYPE_CHECKING
+
 from stages.command import run
 
-if __name__ == "__main__":  # here, for --help waits for no import below
-    raise SystemExit(run(__doc__ or "", "stages.extract", sections=("data", "vlm", "extract")))
+if TYPE_CHECKING:
+    from pipeline.base.config import Params
 
-from pipeline.base.config import Params
-from pipeline.extract.run import extract
+SECTIONS = ("data", "vlm", "extract")
 
 
-def main(params: Params) -> None:
+def main(params: "Params") -> None:
     """Extract and report."""
+    from pipeline.extract.run import extract
+
     store = params.extract.store
     report = extract(params, say=print)
     if report is not None:
@@ -47,3 +50,7 @@ def main(params: Params) -> None:
                 f"the model worked {report.model_share:.0%} of the time and waited "
                 f"{report.waited_share:.0%} for frames"
             )
+
+
+if __name__ == "__main__":
+    raise SystemExit(run(__doc__ or "", main, sections=SECTIONS))

@@ -17,29 +17,32 @@ Works in `<finetune.output>.part` and renames it when finished; stopped or kille
 goes on from the last checkpoint. At its end it prints what to run next.
 """
 
+from typing import TYPE_CHECKING
+
 from stages.command import run
 
-if __name__ == "__main__":  # here, for --help waits for no import below
-    raise SystemExit(run(__doc__ or "", "stages.finetune", sections=("finetune", "train_head")))
+if TYPE_CHECKING:
+    from pipeline.base.config import Params
 
-from pipeline.base.config import Params
-from pipeline.store import FeatureStore, check_trailers
-from pipeline.train.finetuning import (
-    ModelFeatureSource,
-    head_params,
-    next_steps,
-    out_of_memory_named,
-)
-from pipeline.train.log import check_loggers
-from pipeline.train.loop import Trainer
-from pipeline.train.process_group import process_device, process_group
-from pipeline.train.run import open_run, run_lock
-from pipeline.train.split import split_by_episode
-from pipeline.train.training_data import refuse_tuned_episodes
+SECTIONS = ("finetune", "train_head")
 
 
-def main(params: Params) -> None:
+def main(params: "Params") -> None:
     """Tune the model that `vlm` and `finetune` describe."""
+    from pipeline.store import FeatureStore, check_trailers
+    from pipeline.train.finetuning import (
+        ModelFeatureSource,
+        head_params,
+        next_steps,
+        out_of_memory_named,
+    )
+    from pipeline.train.log import check_loggers
+    from pipeline.train.loop import Trainer
+    from pipeline.train.process_group import process_device, process_group
+    from pipeline.train.run import open_run, run_lock
+    from pipeline.train.split import split_by_episode
+    from pipeline.train.training_data import refuse_tuned_episodes
+
     with process_group(params.train_head.device) as world:
         head = head_params(params)
         world.shared(lambda: check_loggers(head))
@@ -60,3 +63,7 @@ def main(params: Params) -> None:
             trainer.fit()
         world.say(f"best and last checkpoint: {opened.output}; curves: {head.logs}")
         world.say(*next_steps(params.finetune, store))
+
+
+if __name__ == "__main__":
+    raise SystemExit(run(__doc__ or "", main, sections=SECTIONS))

@@ -16,35 +16,34 @@ goes into reports/inspect itself, and with --set inspect.output=FOLDER always in
 again replaces the page, its pictures and findings.csv there, and touches no other file.
 """
 
+from collections.abc import Iterator
+from typing import TYPE_CHECKING
+
 from stages.command import Shorthand, run
 
-PATH = Shorthand(
-    "path", "inspect.path", "recordings, folders or globs of them, or a store", "PATH", "*"
+if TYPE_CHECKING:
+    from pipeline.base.config import Params
+    from pipeline.look.page.blocks import Report
+    from pipeline.look.subject import Subject
+
+SECTIONS = ("inspect", "data")
+SHORTHANDS = (
+    Shorthand(
+        "path", "inspect.path", "recordings, folders or globs of them, or a store", "PATH", "*"
+    ),
 )
-
-if __name__ == "__main__":  # here, for --help waits for no import below
-    raise SystemExit(
-        run(__doc__ or "", "stages.inspect", shorthands=[PATH], sections=("inspect", "data"))
-    )
-
-from collections.abc import Iterator
-
-from pipeline.base.config import Params
-from pipeline.base.files import REPORT, claim
-from pipeline.look.page.blocks import Issues, Report
-from pipeline.look.page.issues import FINDINGS, group_issues, place_of, places_of
-from pipeline.look.page.style import boxes
-from pipeline.look.page.writing import write_report
-from pipeline.look.recording.page import recordings_report
-from pipeline.look.store import inspect_store, store_report
-from pipeline.look.subject import Subject, subject_of
-
 SHOWN = 8
 """Findings that the terminal shows."""
 
 
-def main(params: Params) -> None:
+def main(params: "Params") -> None:
     """Write the page of what `inspect.path` names."""
+    from pipeline.base.files import REPORT, claim
+    from pipeline.look.page.issues import FINDINGS
+    from pipeline.look.page.style import boxes
+    from pipeline.look.page.writing import write_report
+    from pipeline.look.subject import subject_of
+
     subject = subject_of(params)
     report = _report(subject, params)
     for folder in (params.inspect.output, subject.folder):
@@ -56,8 +55,11 @@ def main(params: Params) -> None:
     print(f"{page}: the page, with {pictures} pictures and {FINDINGS} beside it")
 
 
-def summary(report: Report) -> Iterator[str]:
+def summary(report: "Report") -> Iterator[str]:
     """What the page says first, for a terminal."""
+    from pipeline.look.page.blocks import Issues
+    from pipeline.look.page.issues import FINDINGS, group_issues, place_of, places_of
+
     yield report.title
     yield " · ".join(f"{label} {value}" for label, value in report.tiles)
     # The first block of issues holds those of the whole page.
@@ -74,7 +76,14 @@ def summary(report: Report) -> Iterator[str]:
         yield f"… and {len(groups) - SHOWN} more on the page and in {FINDINGS}"
 
 
-def _report(subject: Subject, params: Params) -> Report:
+def _report(subject: "Subject", params: "Params") -> "Report":
+    from pipeline.look.recording.page import recordings_report
+    from pipeline.look.store import inspect_store, store_report
+
     if subject.store is not None:
         return store_report(inspect_store(subject.store, params.inspect))
     return recordings_report(subject.recordings(params.data.views), params, subject.name)
+
+
+if __name__ == "__main__":
+    raise SystemExit(run(__doc__ or "", main, shorthands=SHORTHANDS, sections=SECTIONS))

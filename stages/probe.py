@@ -16,22 +16,25 @@ action chunk that is predicted).
 Next: set vlm.pooling to that line, then python -m stages.extract
 """
 
+from typing import TYPE_CHECKING
+
 from stages.command import run
 
-if __name__ == "__main__":  # here, for --help waits for no import below
-    raise SystemExit(run(__doc__ or "", "stages.probe", sections=("probe",)))
+if TYPE_CHECKING:
+    from pipeline.base.config import Params
 
-from pipeline.base.config import Params
-from pipeline.base.files import REPORT, claim, refuse_foreign
-from pipeline.evaluate.probe.study import probe
-from pipeline.evaluate.probe.tables import advice, table, write_tables
-from pipeline.look.page.style import write
-from pipeline.look.probe import draw_gains
-from pipeline.store import FeatureStore, check_trailers
+SECTIONS = ("probe",)
 
 
-def main(params: Params) -> None:
+def main(params: "Params") -> None:
     """Probe the store that `probe` names."""
+    from pipeline.base.files import REPORT, claim, refuse_foreign
+    from pipeline.evaluate.probe.study import probe
+    from pipeline.evaluate.probe.tables import advice, table, write_tables
+    from pipeline.look.page.style import write
+    from pipeline.look.probe import draw_gains
+    from pipeline.store import FeatureStore, check_trailers
+
     wanted = params.probe
     refuse_foreign(wanted.output, REPORT)
     store = FeatureStore.open(wanted.store or params.extract.store)
@@ -48,3 +51,7 @@ def main(params: Params) -> None:
     print(table(study))
     print(advice(study))
     print(f"{wanted.output}: {', '.join(file.name for file in files)}")
+
+
+if __name__ == "__main__":
+    raise SystemExit(run(__doc__ or "", main, sections=SECTIONS))

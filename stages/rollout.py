@@ -12,31 +12,25 @@ beside.csv (those of the others), settings.json and a page (report.html) into `r
   python -m stages.rollout --set rollout.server=ws://127.0.0.1:8000   what stages.serve answers
 """
 
-from stages.command import run
-
-if __name__ == "__main__":  # here, for --help waits for no import below
-    raise SystemExit(run(__doc__ or "", "stages.rollout", sections=("rollout",)))
-
 import os
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from pipeline.base.config import Params, RolloutParams
-from pipeline.base.device import resolve_device
-from pipeline.base.files import REPORT, claim, refuse_foreign, write_document
-from pipeline.evaluate.rollout_driver import roll_out, roll_out_served
-from pipeline.evaluate.rollouts import Rollouts
-from pipeline.look.page.blocks import Report
-from pipeline.look.page.writing import write_report
-from pipeline.look.rollout import rollout_report
-from pipeline.policy.checkpoint import find_policy, load_policy
-from pipeline.robot.client import TOKEN_VARIABLE, PolicyClient
-from pipeline.robot.live_features import LiveFeatures
+from stages.command import run
+
+if TYPE_CHECKING:
+    from pipeline.base.config import Params, RolloutParams
+    from pipeline.evaluate.rollouts import Rollouts
+
+SECTIONS = ("rollout",)
 
 
-def main(params: Params) -> None:
+def main(params: "Params") -> None:
     """Run the checkpoint that `rollout` names, else what `train_head` wrote."""
+    from pipeline.base.files import REPORT, refuse_foreign
+
     wanted = params.rollout
     refuse_foreign(wanted.output, REPORT)
     if wanted.environment is None:
@@ -53,6 +47,10 @@ def main(params: Params) -> None:
 
 def _write_nothing(folder: Path) -> None:
     """A page that says so, in place of what earlier rollouts left."""
+    from pipeline.base.files import REPORT, claim, write_document
+    from pipeline.look.page.blocks import Report
+    from pipeline.look.page.writing import write_report
+
     claim(folder, REPORT)
     for name in ("settings.json", "episodes.csv", "beside.csv"):
         (folder / name).unlink(missing_ok=True)
@@ -60,8 +58,13 @@ def _write_nothing(folder: Path) -> None:
     write_report(folder, Report("No rollouts", "`rollout.environment` is null.", (), ()))
 
 
-def _here(params: Params, say: Callable[[str], None]) -> Rollouts:
+def _here(params: "Params", say: Callable[[str], None]) -> "Rollouts":
     """Those of a checkpoint, with the model in this process."""
+    from pipeline.base.device import resolve_device
+    from pipeline.evaluate.rollout_driver import roll_out
+    from pipeline.policy.checkpoint import find_policy, load_policy
+    from pipeline.robot.live_features import LiveFeatures
+
     wanted = params.rollout
     folder = wanted.checkpoint or params.train_head.output
     checkpoint = load_policy(find_policy(folder))
@@ -71,8 +74,11 @@ def _here(params: Params, say: Callable[[str], None]) -> Rollouts:
     return roll_out(checkpoint, str(folder), checkpoint.policy(device), load, wanted, say)
 
 
-def _served(wanted: RolloutParams, say: Callable[[str], None]) -> Rollouts:
+def _served(wanted: "RolloutParams", say: Callable[[str], None]) -> "Rollouts":
     """Those of the policy that `rollout.server` serves."""
+    from pipeline.evaluate.rollout_driver import roll_out_served
+    from pipeline.robot.client import TOKEN_VARIABLE, PolicyClient
+
     assert wanted.server is not None
     with PolicyClient(wanted.server, token=os.environ.get(TOKEN_VARIABLE)) as server:
         told = server.metadata
@@ -80,8 +86,12 @@ def _served(wanted: RolloutParams, say: Callable[[str], None]) -> Rollouts:
         return roll_out_served(server, wanted, say)
 
 
-def _write(folder: Path, rollouts: Rollouts) -> list[Path]:
+def _write(folder: Path, rollouts: "Rollouts") -> list[Path]:
     """Metrics, the table of episodes and the page; returns their paths."""
+    from pipeline.base.files import REPORT, claim, write_document
+    from pipeline.look.page.writing import write_report
+    from pipeline.look.rollout import rollout_report
+
     claim(folder, REPORT)
     write_document(folder / "metrics.json", rollouts.document())
     write_document(folder / "settings.json", dict(rollouts.settings))
@@ -95,3 +105,7 @@ def _write(folder: Path, rollouts: Rollouts) -> list[Path]:
         *tables,
         *write_report(folder, rollout_report(rollouts)),
     ]
+
+
+if __name__ == "__main__":
+    raise SystemExit(run(__doc__ or "", main, sections=SECTIONS))

@@ -14,21 +14,23 @@ that have come, and stops.
 Next: pipeline.robot.client on the robot's computer, or openpi-client
 """
 
-from stages.command import run
-
-if __name__ == "__main__":  # here, for --help waits for no import below
-    raise SystemExit(run(__doc__ or "", "stages.serve", sections=("serve",)))
-
 from contextlib import closing
 from functools import partial
+from typing import TYPE_CHECKING
 
-from pipeline.base.config import Params
-from pipeline.robot.server import PolicyServer, listen, read_token
-from pipeline.robot.session import ServedPolicy
+from stages.command import run
+
+if TYPE_CHECKING:
+    from pipeline.base.config import Params
+
+SECTIONS = ("serve",)
 
 
-def main(params: Params) -> None:
+def main(params: "Params") -> None:
     """Serve the checkpoint that `serve` names, else what `train_head` wrote."""
+    from pipeline.robot.server import PolicyServer, listen, read_token
+    from pipeline.robot.session import ServedPolicy
+
     wanted, say = params.serve, partial(print, flush=True)
     token = read_token(wanted)
     folder = wanted.checkpoint or params.train_head.output
@@ -46,3 +48,7 @@ def main(params: Params) -> None:
             stopped = server.run(partial(say, said))
     if stopped:
         raise KeyboardInterrupt
+
+
+if __name__ == "__main__":
+    raise SystemExit(run(__doc__ or "", main, sections=SECTIONS))

@@ -12,8 +12,19 @@
 list and gc without --remove write nothing. Next after a merge: python -m stages.verify
 """
 
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
 from stages.command import Shorthand, run
 
+if TYPE_CHECKING:
+    from pipeline.base.config import Params, StoresParams
+    from pipeline.base.errors import PipelineError
+    from pipeline.store.inventory import StoreEntry
+
+SECTIONS = ("stores",)
 SHORTHANDS = (
     Shorthand("action", "stores.action", "list, merge or gc", "ACTION", "?"),
     Shorthand(
@@ -27,33 +38,8 @@ SHORTHANDS = (
     Shorthand("--remove", "stores.remove", "gc removes what it lists"),
 )
 
-if __name__ == "__main__":  # here, for --help waits for no import below
-    raise SystemExit(
-        run(__doc__ or "", "stages.store", shorthands=SHORTHANDS, sections=("stores",))
-    )
 
-import sys
-from collections.abc import Sequence
-from pathlib import Path
-
-from pipeline.base.config import Params, StoresParams
-from pipeline.base.errors import ConfigError, PipelineError, StoreLocked
-from pipeline.base.format import size
-from pipeline.store import FeatureStore
-from pipeline.store.inventory import (
-    StoreEntry,
-    describe_kept,
-    describe_stores,
-    fate_of,
-    find_named,
-    list_stores,
-    remove_entry,
-)
-from pipeline.store.merging import merge
-from pipeline.train.run import find_trained
-
-
-def main(params: Params) -> None:
+def main(params: "Params") -> None:
     """Do what `stores.action` says."""
     match params.stores.action:
         case "list":
@@ -64,7 +50,10 @@ def main(params: Params) -> None:
             _gc(params.stores)
 
 
-def _list(params: StoresParams) -> None:
+def _list(params: "StoresParams") -> None:
+    from pipeline.base.errors import ConfigError
+    from pipeline.store.inventory import describe_stores, list_stores
+
     if params.inputs:
         raise ConfigError(
             f"stores.inputs: list takes no paths, found {', '.join(map(str, params.inputs))}. It "
@@ -74,8 +63,11 @@ def _list(params: StoresParams) -> None:
     print(*describe_stores(params.folder, entries, _dependents(entries, params)), sep="\n")
 
 
-def _dependents(entries: Sequence[StoreEntry], params: StoresParams) -> dict[Path, list[str]]:
+def _dependents(entries: "Sequence[StoreEntry]", params: "StoresParams") -> dict[Path, list[str]]:
     """The trained policies that depend on each store; those that cannot be read go to stderr."""
+    from pipeline.store import FeatureStore
+    from pipeline.train.run import find_trained
+
     trained = find_trained(params.checkpoints)
     for policy in trained:
         if policy.damage:
@@ -89,7 +81,9 @@ def _dependents(entries: Sequence[StoreEntry], params: StoresParams) -> dict[Pat
     return dependents
 
 
-def _merge(params: StoresParams) -> None:
+def _merge(params: "StoresParams") -> None:
+    from pipeline.store.merging import merge
+
     merged = merge(params.inputs, params.output)
     if merged is not None:
         print(
@@ -98,7 +92,17 @@ def _merge(params: StoresParams) -> None:
         )
 
 
-def _gc(params: StoresParams) -> None:
+def _gc(params: "StoresParams") -> None:
+    from pipeline.base.errors import StoreLocked
+    from pipeline.base.format import size
+    from pipeline.store.inventory import (
+        describe_kept,
+        fate_of,
+        find_named,
+        list_stores,
+        remove_entry,
+    )
+
     if params.inputs:
         folders = dict.fromkeys(path.parent for path in params.inputs)
         entries = [entry for at in folders for entry in list_stores(at, subfolders=False)]
@@ -124,3 +128,7 @@ def _gc(params: StoresParams) -> None:
         print(f"{freed} in {len(leftovers)} place(s); --remove removes them")
     if locked:
         raise locked[0]
+
+
+if __name__ == "__main__":
+    raise SystemExit(run(__doc__ or "", main, shorthands=SHORTHANDS, sections=SECTIONS))

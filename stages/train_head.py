@@ -20,20 +20,20 @@ from the last checkpoint; finished, it does nothing; with other params it begins
 Next: python -m stages.evaluate
 """
 
+from typing import TYPE_CHECKING
+
 from stages.command import run
 
-if __name__ == "__main__":  # here, for --help waits for no import below
-    raise SystemExit(run(__doc__ or "", "stages.train_head", sections=("train_head",)))
+if TYPE_CHECKING:
+    from pipeline.base.config import Params
 
-from pipeline.base.config import Params
-from pipeline.store import FeatureStore, check_trailers
-from pipeline.train.run import finished_run, open_run, run_lock
-from pipeline.train.split import split_by_episode
-from pipeline.train.training_data import refuse_tuned_episodes
+SECTIONS = ("train_head",)
 
 
-def main(params: Params) -> None:
+def main(params: "Params") -> None:
     """Train the head that `train_head` describes."""
+    from pipeline.train.run import finished_run
+
     finished = finished_run(params.train_head, params.train_head.store or params.extract.store)
     if finished is None:
         _train(params)
@@ -41,11 +41,15 @@ def main(params: Params) -> None:
         print(*finished.notes, "nothing to do", sep="\n")
 
 
-def _train(params: Params) -> None:
+def _train(params: "Params") -> None:
     # With torch, which takes over a second to import.
+    from pipeline.store import FeatureStore, check_trailers
     from pipeline.train.log import check_loggers
     from pipeline.train.loop import Trainer
     from pipeline.train.process_group import process_group
+    from pipeline.train.run import open_run, run_lock
+    from pipeline.train.split import split_by_episode
+    from pipeline.train.training_data import refuse_tuned_episodes
 
     head = params.train_head
     with process_group(head.device) as world:
@@ -65,3 +69,7 @@ def _train(params: Params) -> None:
             world.say(*trainer.summary())
             trainer.fit()
         world.say(f"best and last checkpoint: {opened.output}; curves: {head.logs}")
+
+
+if __name__ == "__main__":
+    raise SystemExit(run(__doc__ or "", main, sections=SECTIONS))

@@ -14,8 +14,15 @@ where the store is sound; 2 with everything that is wrong and what to run next.
 The store itself is never written to.
 """
 
+from functools import partial
+from typing import TYPE_CHECKING
+
 from stages.command import Shorthand, run
 
+if TYPE_CHECKING:
+    from pipeline.base.config import Params
+
+SECTIONS = ("verify",)
 SHORTHANDS = (
     Shorthand("--reextract", "verify.reextract", "random rows to compute again", value="N"),
     Shorthand("--repair", "verify.repair", "begin a new build without what is damaged"),
@@ -28,26 +35,15 @@ SHORTHANDS = (
     ),
 )
 
-if __name__ == "__main__":  # here, for --help waits for no import below
-    raise SystemExit(
-        run(__doc__ or "", "stages.verify", shorthands=SHORTHANDS, sections=("verify",))
-    )
 
-from functools import partial
-
-from pipeline.base.config import Params
-from pipeline.base.device import resolve_device
-from pipeline.base.errors import NumericsError, StoreIncomplete
-from pipeline.extract.reextract import reextract
-from pipeline.extract.repair import repair
-from pipeline.policy.checkpoint import find_policy, load_policy
-from pipeline.robot.live_features import LiveFeatures, prove
-from pipeline.store.repair_hints import mend
-from pipeline.store.verification import verify
-
-
-def main(params: Params) -> None:
+def main(params: "Params") -> None:
     """Check, and repair or compute rows again where asked to; raises where something is wrong."""
+    from pipeline.base.errors import NumericsError, StoreIncomplete
+    from pipeline.extract.reextract import reextract
+    from pipeline.extract.repair import repair
+    from pipeline.store.repair_hints import mend
+    from pipeline.store.verification import verify
+
     if params.verify.checkpoint:
         _prove(params)
         return
@@ -70,8 +66,12 @@ def main(params: Params) -> None:
             raise NumericsError("\n".join(lines))
 
 
-def _prove(params: Params) -> None:
+def _prove(params: "Params") -> None:
     """Compute the golden rows of the checkpoint again, where and as `stages.serve` does."""
+    from pipeline.base.device import resolve_device
+    from pipeline.policy.checkpoint import find_policy, load_policy
+    from pipeline.robot.live_features import LiveFeatures, prove
+
     named = params.verify.checkpoint
     folder = find_policy(params.train_head.output if named in (None, True) else named)
     checkpoint, device = load_policy(folder), resolve_device(params.serve.device)
@@ -81,3 +81,7 @@ def _prove(params: Params) -> None:
         return
     say(f"{folder} (step {checkpoint.step}): {len(checkpoint.golden)} golden rows, {device}")
     prove(checkpoint, LiveFeatures(params.vlm, trained, str(device)), say)
+
+
+if __name__ == "__main__":
+    raise SystemExit(run(__doc__ or "", main, shorthands=SHORTHANDS, sections=SECTIONS))

@@ -137,7 +137,7 @@ def _executed(comparison: Comparison, rollout: str) -> list[Block]:
         Text(f"{sentence(title)} {sentence(tables.verdicts(comparison))}"),
         replace(errors, caption=sentence(tables.FOOTNOTE)),
         Picture("methods", caption, partial(draw_methods, comparison)),
-        Text(f"{success}: the rollouts do." if rollout else f"{success}.", rollout),
+        Text(f"{success}: stages.rollout does." if rollout else f"{success}.", rollout),
     ]
 
 

@@ -14,12 +14,11 @@ from typing import Any
 import numpy as np
 
 import pipeline.policy.checkpoint as checkpoint
-import stages.verify
 from pipeline.base.errors import CheckpointIncomplete
 from pipeline.data.jpeg import JpegCamera
 from pipeline.data.raw import RawRecording
 from pipeline.policy.policy import Policy
-from pipeline.store import StoreBuild
+from pipeline.store import StoreBuild, verification
 from pipeline.store.metadata import note_metadata
 from pipeline.store.paths import group_attributes
 from tests.fuzz.cases import Case
@@ -113,7 +112,7 @@ FAULTS: dict[str, tuple[str, str, Callable[[], object]]] = {
             JpegCamera, "read", lambda read: lambda camera, rows: read(camera, [0 for _ in rows])
         ),
     ),
-    "a blind check of a store": ("store", "wrong", _plant(stages.verify, "verify", _blind)),
+    "a blind check of a store": ("store", "wrong", _plant(verification, "verify", _blind)),
     "a store that nothing reads": (
         "extraction",
         "wrong",

@@ -153,8 +153,8 @@ def test_a_headline_says_how_much_worse_where_there_is_no_interval(judgement: Ev
 
 def test_rollouts_are_named_where_there_are_some(judgement: Evaluation) -> None:
     bare = replace(judgement, study=None)
-    assert "the rollouts do" not in str(evaluation_report(bare))
-    assert "the rollouts do" in str(evaluation_report(bare, "../rollout/report.html"))
+    assert "stages.rollout does" not in str(evaluation_report(bare))
+    assert "stages.rollout does" in str(evaluation_report(bare, "../rollout/report.html"))
 
 
 def test_dimensions_that_hardly_move_stand_at_the_top(judgement: Evaluation) -> None:

@@ -1,6 +1,7 @@
 """Exit codes and messages that every stage shares."""
 
 import os
+import re
 import runpy
 import signal
 import subprocess
@@ -9,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+import stages.__main__
 from pipeline.base.errors import RecordingError
 from stages import command
 from stages.command import Shorthand, run
@@ -127,11 +129,9 @@ def test_one_and_a_word_when_stopped(capsys, sent):
         os.kill(os.getpid(), sent)
         signal.pause()
 
-    before = signal.getsignal(signal.SIGTERM)
-    try:
-        assert run("Summary.", work, ["--params", PARAMS]) == 1
-    finally:
-        signal.signal(signal.SIGTERM, before)
+    before = signal.getsignal(sent)
+    assert run("Summary.", work, ["--params", PARAMS]) == 1
+    assert signal.getsignal(sent) is before
     assert "run the same command again" in capsys.readouterr().err
 
 
@@ -196,15 +196,6 @@ def test_one_and_a_word_when_stopped_while_it_imports(tmp_path, module, sent):
     assert ended == (1, "stopped; run the same command again\n")
 
 
-def test_work_that_is_named_is_imported_when_the_params_are_good(monkeypatch, tmp_path):
-    (tmp_path / "named_work.py").write_text("seen = []\nmain = seen.append\n")
-    monkeypatch.syspath_prepend(tmp_path)
-    assert run("Summary.", "named_work", ["--params", PARAMS, "--set", "nothing.like=it"]) == 2
-    assert "named_work" not in sys.modules
-    assert run("Summary.", "named_work", ["--params", PARAMS, "--set", "data.action_hz=5"]) == 0
-    assert sys.modules.pop("named_work").seen[0].data.action_hz == 5
-
-
 STAGES = sorted(path.stem for path in ROOT.glob("stages/[a-z]*.py") if path.stem != "command")
 
 
@@ -228,9 +219,30 @@ def test_help_explains_each_stage_from_any_folder_at_once(stage, tmp_path):
 
 
 @pytest.mark.parametrize("stage", STAGES)
-def test_a_stage_runs_its_own_work(stage, monkeypatch):
+def test_a_stage_is_a_module_and_a_subcommand_with_the_same_options(stage, monkeypatch):
     given = []
-    monkeypatch.setattr(command, "run", lambda summary, work, **_: given.append(work))
+    monkeypatch.setattr(command, "run", lambda *parts, **named: given.append((parts, named)))
     with pytest.raises(SystemExit):
         runpy.run_path(str(ROOT / f"stages/{stage}.py"), run_name="__main__")
-    assert given == [f"stages.{stage}"]
+    monkeypatch.setattr(stages.__main__, "run", command.run)
+    stages.__main__.main([stage, "--keys"])
+    ((summary, _), named), ((same, work, typed, shorthands, sections, prog), _) = given
+    assert summary == same and work.__module__ == f"stages.{stage}" and typed == ["--keys"]
+    assert named["sections"] == sections and named.get("shorthands", ()) == shorthands
+    assert prog == f"vla-cache {stage}"
+
+
+def test_all_commands_are_listed_and_completed(capsys):
+    assert stages.__main__.main([]) == 0
+    listed = capsys.readouterr().out
+    assert sorted(re.findall(r"^  (\w+) +[A-Z]", listed, re.MULTILINE)) == STAGES
+    assert stages.__main__.main(["--completion", "bash"]) == 0
+    script = capsys.readouterr().out
+    assert f"subparsers=({' '.join(sum(stages.__main__.COMMANDS.values(), ()))})" in script
+    assert "verify_option_strings=(-h --help --params --set --keys --reextract" in script
+
+
+def test_a_command_that_is_none_is_named(capsys):
+    with pytest.raises(SystemExit, match="2"):
+        stages.__main__.main(["extrakt"])
+    assert "invalid choice: 'extrakt' (choose from 'demo', 'extract'" in capsys.readouterr().err

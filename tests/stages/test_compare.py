@@ -14,6 +14,7 @@ from pipeline.base.files import MARKER
 from pipeline.evaluate.baselines import BASELINES
 from pipeline.evaluate.evaluation import JUDGED
 from pipeline.evaluate.experiments import read_experiments
+from pipeline.look.page import writing
 from stages import compare, evaluate, train_head
 from stages.command import run
 
@@ -52,7 +53,7 @@ def evaluated(params: Path, name: str, *options: str) -> int:
     ]
     arguments = ["--params", str(params), *(part for one in own for part in ("--set", one))]
     with pytest.MonkeyPatch.context() as monkeypatch:
-        monkeypatch.setattr(evaluate, "write_report", lambda *_: [])
+        monkeypatch.setattr(writing, "write_report", lambda *_: [])
         return run("", train_head.main, arguments) or run("", evaluate.main, arguments)
 
 

@@ -5,6 +5,8 @@ from pathlib import Path
 import pytest
 import yaml
 
+from pipeline.simulation import demo_recordings
+from pipeline.vlm import demo_checkpoint
 from stages import command, demo
 
 
@@ -36,8 +38,10 @@ def test_writes_recordings_and_checkpoint(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     calls: list[tuple[object, ...]] = []
-    monkeypatch.setattr(demo, "write_demo_recordings", lambda *given: calls.append(given))
-    monkeypatch.setattr(demo, "write_demo_checkpoint", write_weights)
+    monkeypatch.setattr(
+        demo_recordings, "write_demo_recordings", lambda *given: calls.append(given)
+    )
+    monkeypatch.setattr(demo_checkpoint, "write_demo_checkpoint", write_weights)
     # The second time replaces the demo's own.
     for _ in range(2):
         assert command.run("", demo.main, ["--params", str(params)]) == 0
@@ -57,12 +61,12 @@ def test_stopped_while_it_writes_the_same_command_goes_on(
         write_weights(folder, seed)
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(demo, "write_demo_recordings", lambda *given: None)
-    monkeypatch.setattr(demo, "write_demo_checkpoint", stopped)
+    monkeypatch.setattr(demo_recordings, "write_demo_recordings", lambda *given: None)
+    monkeypatch.setattr(demo_checkpoint, "write_demo_checkpoint", stopped)
     assert command.run("", demo.main, ["--params", str(params)]) == 1
     assert capsys.readouterr().err == "stopped; run the same command again\n"
     assert not (tmp_path / "vlm").exists()
-    monkeypatch.setattr(demo, "write_demo_checkpoint", write_weights)
+    monkeypatch.setattr(demo_checkpoint, "write_demo_checkpoint", write_weights)
     assert command.run("", demo.main, ["--params", str(params)]) == 0
     assert (tmp_path / "vlm/weights").exists()
 
@@ -73,7 +77,7 @@ def test_a_checkpoint_that_the_demo_did_not_write_is_left_alone(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    monkeypatch.setattr(demo, "write_demo_checkpoint", write_weights)
+    monkeypatch.setattr(demo_checkpoint, "write_demo_checkpoint", write_weights)
     (tmp_path / "vlm").mkdir()
     (tmp_path / "vlm" / "weights").write_text("real", encoding="utf-8")
     assert command.run("", demo.main, ["--params", str(params)]) == 2
@@ -98,8 +102,8 @@ def test_what_a_user_put_among_the_demos_files_is_left_alone(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    monkeypatch.setattr(demo, "write_demo_recordings", lambda *given: None)
-    monkeypatch.setattr(demo, "write_demo_checkpoint", write_weights)
+    monkeypatch.setattr(demo_recordings, "write_demo_recordings", lambda *given: None)
+    monkeypatch.setattr(demo_checkpoint, "write_demo_checkpoint", write_weights)
     assert command.run("", demo.main, ["--params", str(params)]) == 0
     (tmp_path / "vlm/model.safetensors").write_text("mine", encoding="utf-8")
     assert command.run("", demo.main, ["--params", str(params)]) == 2

@@ -13,6 +13,7 @@ from typing import Any
 import pytest
 import yaml
 
+from pipeline.look.page import writing
 from pipeline.look.page.blocks import Picture, Report, Text
 from pipeline.store.archive import archive
 from pipeline.store.chunks import write_seal
@@ -67,7 +68,7 @@ def reports(monkeypatch: pytest.MonkeyPatch) -> list[Report]:
         found.append(report)
         return []
 
-    monkeypatch.setattr(evaluate, "write_report", kept)
+    monkeypatch.setattr(writing, "write_report", kept)
     return found
 
 

@@ -106,7 +106,7 @@ def test_rows_computed_again(verified, store, capsys, monkeypatch, relative, cod
         assert (path, params.verify.reextract) == (store, 3)
         return Reextraction((Deviation(7, relative, relative, 2, True, "here"),), 1e-3, (), ())
 
-    monkeypatch.setattr("stages.verify.reextract", found)
+    monkeypatch.setattr("pipeline.extract.reextract.reextract", found)
     assert verified("--reextract", "3") == code
     said = capsys.readouterr()
     assert "computed 1 rows again" in said.out
@@ -133,9 +133,9 @@ class TestCheckpoint:
                 raise CheckpointMismatch("2 of 2 golden rows are not the features")
             say("2 golden rows computed again")
 
-        monkeypatch.setattr("stages.verify.load_policy", lambda folder: held)
-        monkeypatch.setattr("stages.verify.LiveFeatures", lambda *given: given)
-        monkeypatch.setattr("stages.verify.prove", prove)
+        monkeypatch.setattr("pipeline.policy.checkpoint.load_policy", lambda folder: held)
+        monkeypatch.setattr("pipeline.robot.live_features.LiveFeatures", lambda *given: given)
+        monkeypatch.setattr("pipeline.robot.live_features.prove", prove)
         return calls
 
     def test_the_one_that_is_named(self, verified, proved, tmp_path, capsys):
@@ -162,13 +162,13 @@ class TestCheckpoint:
     ):
         held = SimpleNamespace(source={"feature_spec": {}}, golden=(), step=9)
         held.policy = lambda: SimpleNamespace(encoders={"state": 1})
-        monkeypatch.setattr("stages.verify.load_policy", lambda folder: held)
+        monkeypatch.setattr("pipeline.policy.checkpoint.load_policy", lambda folder: held)
         assert verified("--checkpoint", str(tmp_path / "head"), *CPU) == 0
         assert "looks at no features, so nothing is to be proved" in capsys.readouterr().out
         assert proved == []
 
     def test_a_refusal(self, verified, proved, tmp_path, capsys, monkeypatch):
-        monkeypatch.setattr("stages.verify.resolve_device", lambda name: "meta")
+        monkeypatch.setattr("pipeline.base.device.resolve_device", lambda name: "meta")
         assert verified("--checkpoint", str(tmp_path / "head")) == 2
         assert capsys.readouterr().err.startswith("error: 2 of 2 golden rows are not")
 
