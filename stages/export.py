@@ -32,7 +32,7 @@ def main(params: "Params") -> None:
     checkpoint = load_policy(find_policy(folder))
     receipt = export_head(checkpoint, str(folder), wanted, say)
     for name, file in receipt["files"].items():
-        off = ", ".join(f"{found['std']:.1e} ({of})" for of, found in file["deviation"].items())
+        off = ", ".join(f"{by['std']:.1e} ({inputs})" for inputs, by in file["deviation"].items())
         say(f"{name}: {file['bytes'] / 1e6:.1f} MB, at most {off} training std off the policy")
     say(f"{wanted.output}: {', '.join(receipt['files'])}, {RECEIPT}")
 
