@@ -14,6 +14,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from importlib import import_module
 from pathlib import Path
 from random import Random
 
@@ -188,7 +189,9 @@ class Case:
             command = [sys.executable, *self.command[1:]]
             return subprocess.run(command, env=environment, check=False).returncode
         parts = {"read": oracle.read_all, "load": oracle.load_head}
-        return run("", parts.get(self.stage, f"stages.{self.stage}"), self.arguments)
+        return run(
+            "", parts.get(self.stage) or import_module(f"stages.{self.stage}").main, self.arguments
+        )
 
     def judge(self, change: Change) -> str:
         """After exit 0: what is not as the files have it; empty where all is right."""

@@ -35,9 +35,10 @@ sys.exit(run("", train_head.main, arguments) or run("", evaluate.main, arguments
 """
 NOTHING_TO_DO = """
 import sys
+from stages import train_head
 from stages.command import run
 
-assert run("", "stages.train_head", sys.argv[1:]) == 0
+assert run("", train_head.main, sys.argv[1:]) == 0
 heavy = "torch transformers dask distributed scipy matplotlib sklearn pandas"
 print(sorted(set(heavy.split()) & sys.modules.keys()))
 """
