@@ -42,10 +42,8 @@ def main(params: "Params") -> None:
             f"{len(lacking)} thing(s) are missing: {subjects}. Do what stands behind -> there, "
             f"then run {command('doctor')} again."
         )
-    print(
-        f"nothing that was looked at is missing; {command('extract', '--set extract.plan=true')} "
-        "reads every episode"
-    )
+    print("nothing that was looked at is missing; to read every episode, run")
+    print(f"  {command('extract', '--set extract.plan=true')}")
 
 
 if __name__ == "__main__":

@@ -12,7 +12,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[2]
 LEFT_OUT = "pipeline.base.config"
 """`params.md` says it better."""
-IN_FULL = {"data": ("reader", "recording", "timeline"), "store": ("schema", "reader", "batch")}
+IN_FULL = {"data": ("discovery", "recording", "timeline"), "store": ("schema", "reader", "batch")}
 """Modules of a package that are shown in full, beside what its `__all__` offers."""
 
 

@@ -87,8 +87,6 @@ def _check_output(folder: Path) -> None:
     wrong = "" if os.access(there, os.W_OK | os.X_OK) else f"{there} cannot be written to"
     if not there.is_dir():
         wrong = f"expected a folder, found the file {there}"
-    for store in filter(_is_store, places):
-        wrong = f"{folder} lies in the store {store}, where nothing else may be"
     if wrong:
         raise ConfigError(f"inspect.output: {wrong}. Name another: --set inspect.output=FOLDER")
 

@@ -227,8 +227,8 @@ class TestWhatItTakesOver:
         run(params)
         heavy = {"torch", "transformers", "dask", "distributed", "peft", "scipy", "matplotlib"}
         code = (
-            "import sys\nfrom stages.command import run\n"
-            "assert run('', 'stages.extract', sys.argv[1:]) == 0\n"
+            "import sys\nfrom stages.extract import main\nfrom stages.command import run\n"
+            "assert run('', main, sys.argv[1:]) == 0\n"
             f"print(sorted({heavy} & sys.modules.keys()))"
         )
         command = [sys.executable, "-c", code, "--params", str(params_file)]

@@ -29,7 +29,7 @@ def looked(
 
     def look(*arguments: object) -> int:
         words = [*map(str, arguments), *options]
-        return run("", inspect.main, words, shorthands=[inspect.PATH])
+        return run("", inspect.main, words, shorthands=inspect.SHORTHANDS)
 
     return look
 

@@ -23,7 +23,8 @@ from pipeline.store.inventory import (
     list_stores,
     remove_entry,
 )
-from pipeline.store.paths import KEPT, STORE, previous_path, set_build_aside
+from pipeline.store.metadata import note_metadata
+from pipeline.store.paths import KEPT, STORE, group_attributes, previous_path, set_build_aside
 from pipeline.store.schema import read_specs
 
 Make = Callable[..., Path]
@@ -69,6 +70,9 @@ def unfinish(store: Path, done: int) -> Path:
     rows = build.specs["vl/checksum"].shape[0]
     build.write("vl/checksum", done, build.files("vl/checksum").read(done, rows - done) * 0)
     build.close()
+    attributes = group_attributes(part)
+    del attributes["seal"]
+    note_metadata(part, attributes)
     return part
 
 

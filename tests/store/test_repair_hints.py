@@ -11,7 +11,7 @@ from pipeline.store.repair_hints import mend, restore_command, start_over
 @pytest.mark.parametrize("inside", ["", "zarr.json", "vl/features/c/0/0/0"])
 def test_a_store_is_repaired_and_extracted_by_name(inside: str) -> None:
     said = mend(Path("some/my store.zarr") / inside)
-    assert """stages.verify --repair --set 'verify.store="some/my store.zarr"'""" in said
+    assert "stages.verify --repair --set 'verify.store=some/my store.zarr'" in said
     assert "stages.extract" not in said, "it would replace a store that the params do not describe"
     assert ".part" not in said
 
