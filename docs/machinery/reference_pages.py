@@ -1,7 +1,8 @@
 """The pages of the reference: one a room, made of its docstrings.
 
 A package shows what its `__all__` offers, where it is defined; one that offers its modules instead
-shows each of them in full. So do the modules that a recipe sends the reader to.
+shows each of them in full. So do the modules that a recipe sends the reader to. A name that another
+package defines is a link.
 """
 
 import ast
@@ -35,7 +36,12 @@ def _room_page(room: str) -> str:
     if not homes:
         in_full = [name for name in _modules(package) if not name.startswith(LEFT_OUT)]
     blocks = [_block(f"pipeline.{room}", docstring_only=True), *map(_block, in_full)]
-    blocks += [_block(f"{home}.{name}") for name, home in homes.items() if home not in in_full]
+    own = f"pipeline.{room}."
+    for name, home in homes.items():
+        if not home.startswith(own):
+            blocks.append(f"- [`{name}`][{home}.{name}]")
+        elif home not in in_full:
+            blocks.append(_block(f"{home}.{name}"))
     return "\n".join([f"# {room}\n", *blocks])
 
 
