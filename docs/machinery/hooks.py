@@ -27,16 +27,24 @@ sys.path[:0] = [path for path in (str(HERE), str(ROOT)) if path not in sys.path]
 from params_page import params_page  # noqa: E402
 from reference_pages import reference_pages  # noqa: E402
 
-REFERENCE = "Reference"
+REFERENCE = "reference/index.md"
 IMAGE = re.compile(r'<p>\s*<img\s[^>]*?src="([^"]*figures/[\w-]+\.svg)"[^>]*>\s*</p>')
 LINK = re.compile(r"(?<!!)\[([^\]]*)\]\(((?:\.\./)+[^)\s#]*)(?:#[^)\s]*)?\)")
 
 
 def on_config(config: MkDocsConfig) -> MkDocsConfig:
-    """Put the pages of the reference into the navigation."""
-    for entry in config.nav or []:
-        if isinstance(entry, dict) and REFERENCE in entry:
-            entry[REFERENCE] = ["reference/index.md", *reference_pages()]
+    """Put the pages of the reference into the navigation, behind their index."""
+
+    def extend(entries: list[Any]) -> None:
+        if REFERENCE in entries:
+            entries += reference_pages()
+        for entry in entries:
+            if isinstance(entry, dict):
+                for below in entry.values():
+                    if isinstance(below, list):
+                        extend(below)
+
+    extend(config.nav or [])
     return config
 
 

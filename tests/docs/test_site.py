@@ -12,7 +12,7 @@ DESKTOP, PHONE = (1280, 900), (390, 844)
 SIDEWAYS = """[...document.querySelectorAll('figure.drawing')]
     .filter(figure => figure.scrollWidth > figure.clientWidth).map(figure => figure.outerHTML)"""
 """The figures that a reader has to push sideways to see whole."""
-PAGES = ("index", "concepts", "store", "params", "data/errors", "reference/store", "faq")
+PAGES = ("index", "concepts", "store", "params", "data/errors", "reference/store")
 
 
 class Links(HTMLParser):
