@@ -62,11 +62,12 @@ def check_source(source: Source, opened: Opened, on_bad: str) -> Iterator[Issue]
 
 def _unreadable(recordings: Sequence[Recording]) -> Iterator[str]:
     """Why those of a few evenly spread ones cannot be read that cannot."""
-    for place in sorted({*np.linspace(0, len(recordings) - 1, _EPISODES).round().astype(int)}):
-        recording = recordings[place]
+    spread = np.linspace(0, len(recordings) - 1, min(_EPISODES, len(recordings)))
+    for recording in (recordings[int(place)] for place in spread):
         try:
-            recording.state(), recording.sensor()
-            recording.poses() if recording.has_poses else recording.action()
+            motion = recording.poses if recording.has_poses else recording.action
+            for read in (recording.state, recording.sensor, motion):
+                read()
             for camera in recording.cameras().values():
                 camera.check(range(min(1, len(camera.time))))
         except RecordingError as error:
