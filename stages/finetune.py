@@ -43,26 +43,26 @@ def main(params: "Params") -> None:
     from pipeline.train.split import split_by_episode
     from pipeline.train.training_data import refuse_tuned_episodes
 
-    with process_group(params.train_head.device) as world:
+    with process_group(params.train_head.device) as processes:
         head = head_params(params)
-        world.shared(lambda: check_loggers(head))
+        processes.shared(lambda: check_loggers(head))
         store = FeatureStore.open(head.store or params.extract.store)
-        with world.holding(run_lock(head)), out_of_memory_named():
+        with processes.holding(run_lock(head)), out_of_memory_named():
             source = ModelFeatureSource(store, params, process_device(head.device))
-            opened = world.shared(lambda: open_run(head, store, source.identity, "finetune"))
-            world.say(*opened.notes)
+            opened = processes.shared(lambda: open_run(head, store, source.identity, "finetune"))
+            processes.say(*opened.notes)
             if opened.status == "finished":
-                world.say("nothing to do", *next_steps(params.finetune, store))
+                processes.say("nothing to do", *next_steps(params.finetune, store))
                 return
             if head.check_store:
-                world.shared(lambda: check_trailers(store.path))
+                processes.shared(lambda: check_trailers(store.path))
             split = split_by_episode(store, head.split, head.horizon)
-            world.say(*refuse_tuned_episodes(store, split))
+            processes.say(*refuse_tuned_episodes(store, split))
             trainer = Trainer(store, head, split, opened, source)
-            world.say(*trainer.summary(), *source.summary())
+            processes.say(*trainer.summary(), *source.summary())
             trainer.fit()
-        world.say(f"best and last checkpoint: {opened.output}; curves: {head.logs}")
-        world.say(*next_steps(params.finetune, store))
+        processes.say(f"best and last checkpoint: {opened.output}; curves: {head.logs}")
+        processes.say(*next_steps(params.finetune, store))
 
 
 if __name__ == "__main__":

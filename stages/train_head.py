@@ -52,23 +52,23 @@ def _train(params: "Params") -> None:
     from pipeline.train.training_data import refuse_tuned_episodes
 
     head = params.train_head
-    with process_group(head.device) as world:
-        world.shared(lambda: check_loggers(head))
+    with process_group(head.device) as processes:
+        processes.shared(lambda: check_loggers(head))
         store = FeatureStore.open(head.store or params.extract.store)
-        with world.holding(run_lock(head)):
-            opened = world.shared(lambda: open_run(head, store))
-            world.say(*opened.notes)
+        with processes.holding(run_lock(head)):
+            opened = processes.shared(lambda: open_run(head, store))
+            processes.say(*opened.notes)
             if opened.status == "finished":
-                world.say("nothing to do")
+                processes.say("nothing to do")
                 return
             if head.check_store:
-                world.shared(lambda: check_trailers(store.path))
+                processes.shared(lambda: check_trailers(store.path))
             split = split_by_episode(store, head.split, head.horizon)
-            world.say(*refuse_tuned_episodes(store, split))
+            processes.say(*refuse_tuned_episodes(store, split))
             trainer = Trainer(store, head, split, opened)
-            world.say(*trainer.summary())
+            processes.say(*trainer.summary())
             trainer.fit()
-        world.say(f"best and last checkpoint: {opened.output}; curves: {head.logs}")
+        processes.say(f"best and last checkpoint: {opened.output}; curves: {head.logs}")
 
 
 if __name__ == "__main__":

@@ -181,7 +181,13 @@ def problems(error: ValidationError) -> Iterator[tuple[str, str]]:
         yield named(".".join(map(str, problem["loc"]))), text
 
 
-_SHORT = Repr()
+class _Short(Repr):
+    def repr_int(self, x: int, level: int) -> str:
+        bits = x.bit_length()  # Python writes at most 4,300 digits
+        return super().repr_int(x, level) if bits < 9999 else f"an integer of {bits} bits"
+
+
+_SHORT = _Short()
 _SHORT.maxlevel, _SHORT.maxstring, _SHORT.maxother = 3, 120, 120
 
 

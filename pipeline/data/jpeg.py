@@ -30,6 +30,8 @@ _SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".gif", ".tif", ".tiff", ".webp")
 """Suffixes of images; files that are not decoded are refused by name."""
 _PADDED = re.compile(r"0\d+")
 """A number in place of a time: 000001."""
+_COUNTS = 1e6
+"""Whole numbers below it count frames; a clock in whole seconds since 1970 is above 1e9."""
 _VIEW = re.compile(r"view(?=\d)", re.IGNORECASE)
 
 
@@ -72,10 +74,6 @@ class JpegCamera(CameraStream):
             same[place] = cmp(self.paths[place], self.paths[place + 1], shallow=False)
         return same
 
-    def sizes(self, indices: Sequence[int]) -> NDArray[np.int64]:
-        sizes = [self._each(image_size, index) for index in indices]
-        return np.array(sizes, np.int64).reshape(-1, 2)
-
     def _each(self, ask: Callable[[Path, str, MediaLimits], Seen], index: int) -> Seen:
         return ask(self.paths[index], str(self.paths[index]), self._limits)
 
@@ -93,12 +91,12 @@ def frame_time(path: PurePath) -> float:
 
 
 def _check_not_counted(timed: Sequence[tuple[float, str]]) -> None:
-    """Raise `RecordingError` where the names of frames, by time, count from 0 or 1."""
-    first = timed[0][0] if len(timed) > 1 else -1
-    if first in (0, 1) and all(time == first + k for k, (time, _) in enumerate(timed)):
-        path = Path(timed[-1][1])
-        if path.stem.rpartition("_")[2].isdecimal():  # not 1.0, 2.0
-            raise _no_time(path, f"frames counted from {first:g} to {timed[-1][0]:g}")
+    """Raise `RecordingError` where the names of frames, by time, count: whole numbers below 1e6."""
+    if len(timed) < 2 or timed[-1][0] >= _COUNTS:
+        return
+    if all(PurePath(path).stem.rpartition("_")[2].isdecimal() for _, path in timed):  # not 1.0
+        first, last = timed[0][0], timed[-1][0]
+        raise _no_time(Path(timed[-1][1]), f"frames counted from {first:g} to {last:g}")
 
 
 def _no_time(path: PurePath, found: str) -> RecordingError:
@@ -177,12 +175,6 @@ def read_image(
     """The image (height, width, 3), RGB as stored (EXIF orientation is ignored)."""
     with opened_image(file, where, limits) as image:
         return in_rgb(image)
-
-
-def image_size(file: Path, where: str, limits: MediaLimits = DEFAULT_LIMITS) -> tuple[int, int]:
-    """Height and width as the file's header says."""
-    with opened_image(file, where, limits) as image:
-        return image.height, image.width
 
 
 def check_image(

@@ -197,13 +197,7 @@ class LeRobotRecording(Recording):
         return None if path is None else _read_sidecar(path, self._overrides.limits)
 
     def nominal(self) -> Nominal:
-        clocks = ["action"]
-        if self._sidecar("state") is None:
-            clocks.append("state")
-        if self._sidecar("frames") is None:
-            clocks += [f"view {view}" for view in self.all_views()]
-        mistakes = self._misplaced_rows()
-        return Nominal(dict.fromkeys(clocks, self._info.fps), where=MARKER, mistakes=mistakes)
+        return Nominal(where=MARKER, mistakes=self._misplaced_rows())
 
     def _misplaced_rows(self) -> tuple[str, ...]:
         """A message where `meta/` names another file than the one that holds the rows."""

@@ -7,7 +7,7 @@ that checks its arguments. Any other name is refused before it is looked up.
 
 import pickle
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -79,6 +79,8 @@ _CALLS: dict[str, Callable[..., Any]] = {
     "builtins.bytes": lambda: b"",
 }
 """What the names in a pickle stand for."""
+_SHARED = 100_000
+"""Values that may stand in lists named more than once."""
 _PLAIN = (str, bytes, bytearray, int, float, type(None), np.ndarray)
 
 
@@ -95,14 +97,21 @@ class _Unpickler(pickle.Unpickler):
         return partial(_CALLS[known])
 
 
-def _plain(value: Any) -> Any:
-    """The value with its arrays as numpy's own; refuses what is no data."""
+def _plain(value: Any, left: Iterator[int]) -> Any:
+    """The value with its arrays as numpy's own; refuses what is no data, and when none is `left`.
+
+    A list counts each time that it is named: a few bytes can name one a million times.
+    """
+    if next(left, None) is None:
+        raise _Refused("the same lists again and again")
     if isinstance(value, dict):
-        return {_plain(key): _plain(inner) for key, inner in value.items()}
+        return {_plain(key, left): _plain(inner, left) for key, inner in value.items()}
     if isinstance(value, list | tuple | set | frozenset):
-        return type(value)(map(_plain, value))
+        return type(value)(_plain(inner, left) for inner in value)
     if not isinstance(value, _PLAIN):
         raise _Refused("a dtype or a name without an array")
+    if isinstance(value, int) and value.bit_length() > 64:
+        raise _Refused("an integer of more than 64 bits")
     return np.asarray(value) if isinstance(value, _Array) else value
 
 
@@ -112,11 +121,13 @@ def load_plain(path: Path, most: int) -> Any:
     Scalars of numpy become plain numbers. Raises `RecordingError` naming what else it asks for, of
     which nothing is executed, or how it is damaged, or that the file has more than `most` bytes.
     """
-    check_limit(path, RECORDINGS.check_file(path), most, "array_bytes", "bytes")
+    size = RECORDINGS.check_file(path)
+    check_limit(path, size, most, "array_bytes", "bytes")
     # Damaged bytes make numpy and the unpickler raise almost any exception.
     with RECORDINGS.foreign(path, "damaged pickle"), path.open("rb") as file:
         try:
-            return _plain(_Unpickler(file, encoding="latin1").load())
+            loaded = _Unpickler(file, encoding="latin1").load()
+            return _plain(loaded, iter(range(size + _SHARED)))  # a value takes a byte or more
         except _Refused as error:
             raise INTACT.refusal(
                 path,

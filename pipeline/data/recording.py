@@ -64,10 +64,8 @@ class RecordedAction(Stream):
 
 @dataclass(frozen=True)
 class Nominal:
-    """Rates and counts that a recording's metadata name; empty where they name none."""
+    """What a recording's metadata promise, and where they are wrong; empty where neither."""
 
-    rates_hz: Mapping[str, float] = field(default_factory=dict[str, float])
-    """By clock: `sensor`, `state`, `action`, `view View1`, …"""
     streams: Mapping[str, str] = field(default_factory=dict[str, str])
     """By stream, the entry that says that it was recorded: `state`: `robot_states_count 300`."""
     where: str = ""
@@ -107,10 +105,6 @@ class CameraStream(ABC):
 
     def repeats(self) -> NDArray[np.bool_] | None:
         """(frame - 1,) whether a frame is the one before; None where only decoding tells."""
-        return None
-
-    def sizes(self, indices: Sequence[int]) -> NDArray[np.int64] | None:
-        """(index, 2) height and width of these frames; None where only decoding tells."""
         return None
 
 
@@ -186,7 +180,7 @@ class Recording(ABC):
         return []
 
     def nominal(self) -> Nominal:
-        """Rates and counts that the recording's metadata name."""
+        """What the recording's metadata promise, and where they are wrong."""
         return Nominal()
 
     def state(self) -> Stream | None:

@@ -115,14 +115,12 @@ class WindowedRecording(InsertionRecording):
         return [view for view in list_empty_views(self.path / "images") if self._wants(view)]
 
     def nominal(self) -> Nominal:
-        rates = {"sensor": self._metadata.sensor_hz, "state": self._metadata.robot_hz}
-        known = {name: rate for name, rate in rates.items() if rate is not None}
         streams = promised(
             self._metadata,
             sensor=("sensor_windows_count", "sensor_hz"),
             state=("robot_states_count", "robot_hz"),
         )
-        return Nominal(known, streams, MARKER)
+        return Nominal(streams, MARKER)
 
     def _recorded_instruction(self) -> str:
         return self._metadata.instruction or super()._recorded_instruction()
@@ -191,6 +189,7 @@ def _strides(
     proved = _proved_stride(windows)
     if sensor_hz is not None:
         expected = steps * sensor_hz
+        _check_rate(steps, proved, sensor_hz, where)
     else:
         expected = steps / (np.median(steps) or np.inf) * (proved or width)
     typical = float(np.median(expected))
@@ -212,6 +211,22 @@ def _strides(
             )
         strides.append(stride)
     return strides
+
+
+def _check_rate(
+    steps: NDArray[np.float64], proved: int | None, sensor_hz: float, where: str
+) -> None:
+    """Refuse a `sensor_hz` more than 10 % off what clock and overlap prove.
+
+    Gaps spoil the mean step, stamps in bursts the median; one of them must agree.
+    """
+    usual, mean = float(np.median(steps)), float(steps.mean())
+    if proved and all(abs(step * sensor_hz - proved) > 0.1 * proved for step in (usual, mean)):
+        raise RecordingError(
+            f"{where}: windows advance by {proved} readings every {usual or mean:.4g} s, "
+            f"{proved / (usual or mean or np.inf):.4g} Hz, but sensor_hz in {MARKER} says "
+            f"{sensor_hz:g}; they must agree: correct the metadata"
+        )
 
 
 def _check_finite(windows: Numbers, where: str) -> None:

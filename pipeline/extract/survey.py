@@ -24,6 +24,7 @@ from pipeline.base.format import capped
 from pipeline.base.source import RATE_TOLERANCE, Streams
 from pipeline.data import BadEpisode, Recording, content_digest, open_recordings
 from pipeline.data.episode import Embodiment, common_embodiment, read_episode
+from pipeline.data.recording import absolute
 from pipeline.data.timeline import ActionRotation, choose_action_rotation
 from pipeline.store.border import EpisodeText
 from pipeline.store.episodes import EpisodeRows
@@ -263,9 +264,9 @@ def _refuse_bad(bad: Sequence[BadEpisode], of: int) -> None:
 def _surveyed(
     recording: Recording, data: DataParams, rotation: ActionRotation, digests: ContentDigests
 ) -> SurveyedEpisode:
-    path = Path(os.path.abspath(recording.path))
+    path = absolute(recording.path)
     with suppress(ValueError):  # a path below the data root is said from there: a store can move
-        path = path.relative_to(os.path.abspath(data.root))
+        path = path.relative_to(absolute(data.root))
     text = {
         "id": recording.id,
         "path": path.as_posix(),

@@ -401,6 +401,8 @@ class _Run:
 
     def blame(self, error: Exception) -> tuple[StopKind, str]:
         """Whose error it is, by the part of the tick, and the reason that names it."""
+        if self.timer.part == "check":
+            self.unrecorded = None  # Readings that cannot be checked would spoil the recording.
         kind = _BLAMED.get(self.timer.part, StopKind.LOOP)
         return kind, f"{kind.value} ({self.timer.part}): {type(error).__name__}: {error}"
 

@@ -32,6 +32,7 @@ from websockets.exceptions import ConnectionClosed
 from websockets.frames import CloseCode
 from websockets.http11 import Request, Response
 
+from pipeline.base.border import shown
 from pipeline.base.config import ServeParams
 from pipeline.base.errors import ConfigError, ObservationError, PipelineError, WireError
 from pipeline.robot import wire
@@ -282,7 +283,13 @@ class PolicyServer:
         if path == "/healthz":
             return say(HTTPStatus.OK, "OK\n")
         if foreign:
-            return say(HTTPStatus.FORBIDDEN, "web pages are not served\n")
+            why = "web pages are not served"
+            if "Origin" not in headers:
+                why = (
+                    f"expected Host localhost, found {shown(headers.get('Host'))}: by other names "
+                )
+                why += "only a server with a token is asked (serve.token_file)"
+            return say(HTTPStatus.FORBIDDEN, f"{why}\n")
         if not authorized:
             why = "expected the header Authorization: Api-Key <the server's token>\n"
             return say(HTTPStatus.UNAUTHORIZED, why, **{"WWW-Authenticate": "Api-Key"})

@@ -9,9 +9,9 @@ import sys
 from collections.abc import Generator, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Self
 
-from pydantic import Field, JsonValue
+from pydantic import Field, JsonValue, model_validator
 from safetensors import safe_open
 
 from pipeline.base.border import Border, Document
@@ -136,10 +136,41 @@ def tuned_on(vlm: VLMParams) -> TunedOn | None:
     return joined(map(read_tuned_on, folders))
 
 
-class _Kind(Document):
-    """config.json, before transformers reads it: another kind of model would be taken for one."""
+class _Text(Document):
+    """What transformers has a default for that would give other features of the same weights."""
+
+    hidden_size: int
+    num_hidden_layers: int
+    num_attention_heads: int
+    max_position_embeddings: int
+    rms_norm_eps: float
+
+
+class _Vision(Document):
+    hidden_size: int | None = None
+    num_heads: int | None = None
+    fullatt_block_indexes: list[int] | None = None
+
+    @model_validator(mode="after")
+    def _defaults_are_the_released(self) -> Self:
+        """Versions before 4.51 leave out what is transformers' default: the released tower's."""
+        if self.hidden_size != 1280 and None in (self.num_heads, self.fullatt_block_indexes):
+            raise ValueError("expected num_heads and fullatt_block_indexes")
+        return self
+
+
+class _Config(Document):
+    """config.json, before transformers reads it and fills it up; that of the hub is flat."""
 
     model_type: Literal["qwen2_5_vl"]
+    text_config: _Text
+    vision_config: _Vision
+
+    @model_validator(mode="before")
+    @classmethod
+    def _nest(cls, given: Any) -> Any:
+        flat = isinstance(given, dict) and given.get("text_config") is None
+        return {**given, "text_config": given} if flat else given
 
 
 class _WeightIndex(Document):
@@ -192,10 +223,10 @@ def read_config(folder: Path) -> Any:
 
 
 def check_documents(folder: Path) -> None:
-    """Raise `VLMError` unless a checkpoint is a Qwen2.5-VL without code of its own, not quantized,
-    and without a document, template or text that is no regular file."""
+    """Raise `VLMError` unless a checkpoint is a Qwen2.5-VL whose config decides its features, not
+    quantized, without code of its own, document, template or text that is no regular file."""
     small_files(folder)
-    VLMS.read_json(folder / "config.json", _Kind)
+    VLMS.read_json(folder / "config.json", _Config)
     _refuse_code(folder, VLMS)
 
 

@@ -5,14 +5,14 @@ the model is.
 """
 
 import json
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
-from pydantic import Field, JsonValue
+from pydantic import ConfigDict, Field, JsonValue
 
 from pipeline.base.border import Border, Document, shown
 from pipeline.base.config import VLMParams
@@ -40,6 +40,8 @@ TokenKind = Literal["text", "special", "image"]
 
 class _TokenizerConfig(Document):
     tokenizer_class: Annotated[str, Field(pattern=_TOKENIZERS)] | None = None
+    fast_tokenizer_files: None = None
+    """Files that would be read in place of tokenizer.json, by any path."""
 
 
 class PromptRenderer:
@@ -200,38 +202,67 @@ class PixelSettings:
         """The settings of a checkpoint folder for frames asked for at `resize` (height, width)."""
         from transformers.models.qwen2_vl.image_processing_pil_qwen2_vl import smart_resize
 
-        processor = _read_image_processor(folder)
-        size = processor.size
+        settings = _read_image_processor(folder)
         try:
             image_size = smart_resize(
                 *resize,
-                factor=processor.patch_size * processor.merge_size,
-                min_pixels=size.shortest_edge,
-                max_pixels=size.longest_edge,
+                factor=settings.patch_size * settings.merge_size,
+                min_pixels=settings.size.shortest_edge,
+                max_pixels=settings.size.longest_edge,
             )
         except ValueError as error:
             raise VLMError(
                 f"vlm.image_resize_height and _width {resize[0]} x {resize[1]}: {error}"
             ) from error
-        same = {field.name: getattr(processor, field.name) for field in fields(cls)[2:]}
+        same = settings.model_dump(exclude={"size"})
         return cls(resize, image_size, **same)
 
 
-def _read_image_processor(folder: Path) -> Any:
-    """transformers' image processor of a checkpoint.
+_Pixels = Annotated[int, Field(gt=0, lt=2**31)]
+_Scale = Annotated[float, Field(gt=0)]
+
+
+class _Size(Document):
+    model_config = ConfigDict(from_attributes=True)
+
+    shortest_edge: _Pixels
+    longest_edge: _Pixels
+
+
+class _ImageProcessor(Document):
+    """The settings of transformers' image processor, which takes any value for them."""
+
+    model_config = ConfigDict(from_attributes=True)
+
+    size: _Size
+    patch_size: _Pixels
+    merge_size: _Pixels
+    temporal_patch_size: _Pixels
+    rescale_factor: _Scale
+    image_mean: Annotated[tuple[float, float, float], Field(strict=False)]
+    image_std: Annotated[tuple[_Scale, _Scale, _Scale], Field(strict=False)]
+
+
+class _ProcessorConfig(Document):
+    image_processor: dict[str, JsonValue] | None = None
+
+
+def _read_image_processor(folder: Path) -> _ImageProcessor:
+    """What transformers' image processor of a checkpoint does.
 
     Raises `VLMError` where it does something else than `extractor.patchify`, or its patches are not
     those of the model.
     """
     from transformers.models.qwen2_vl.image_processing_pil_qwen2_vl import Qwen2VLImageProcessorPil
 
-    vision, path = read_config(folder).vision_config, folder / "preprocessor_config.json"
+    vision, path = read_config(folder).vision_config, folder / "processor_config.json"
+    document = VLMS.read_json(path, _ProcessorConfig).image_processor if path.exists() else None
+    if document is None:
+        path = folder / "preprocessor_config.json"
+        document = VLMS.read_json(path, dict[str, JsonValue])
     with quiet_transformers(), VLMS.foreign(path, "cannot be read"):
-        document, _ = Qwen2VLImageProcessorPil.get_image_processor_dict(
-            folder, local_files_only=True
-        )
         processor: Any = Qwen2VLImageProcessorPil.from_dict(document)
-        kind = document.get("image_processor_type", "Qwen2VLImageProcessor")
+        kind = str(document.get("image_processor_type", "Qwen2VLImageProcessor"))
         processor.image_processor_type = kind.removesuffix("Fast").removesuffix("Pil")
         expected = {
             "image_processor_type": "Qwen2VLImageProcessor",
@@ -246,12 +277,7 @@ def _read_image_processor(folder: Path) -> Any:
         for name, value in expected.items():
             if (actual := getattr(processor, name)) != value:
                 raise VLMS.refusal(path, f"expected {name} {value}, found {shown(actual)}")
-        scales = [[processor.rescale_factor] * 3, processor.image_std, processor.image_mean]
-        numbers = np.array(scales, np.float64)
-        if numbers.shape != (3, 3) or not np.isfinite(numbers).all() or numbers[:2].min() <= 0:
-            why = "expected three numbers as image_mean and image_std, and scales above 0, found "
-            raise VLMS.refusal(path, why + shown(scales))
-    return processor
+    return VLMS.parse(processor, _ImageProcessor, path)
 
 
 def stretch(frame: NDArray[np.uint8], image_size: tuple[int, int]) -> NDArray[np.uint8]:

@@ -111,3 +111,7 @@ def test_our_own_refusals_and_ctrl_c_pass() -> None:
 def test_what_is_shown_can_be_printed_anywhere() -> None:
     assert shown("\ud800" * 3).isascii() and len(shown("x" * 10_000)) < 200
     assert named("a/b c") == "a/b c" and "\x1b" not in named("\x1b[31m")
+
+
+def test_an_integer_too_long_to_write_is_described():
+    assert shown([10**5000]) == "[an integer of 16610 bits]"

@@ -114,7 +114,7 @@ def test_numbers_of_frames_are_no_times(names):
 
 
 def test_times_in_whole_seconds_are_no_numbers_of_frames():
-    names = [("0.jpg",), ("0.jpg", "1.jpg", "3.jpg"), ("0.0.jpg", "1.0.jpg"), ("5.jpg", "6.jpg")]
+    names = [("0.jpg",), ("0.0.jpg", "1.0.jpg"), ("1761551500.jpg", "1761551501.jpg")]
     for some in names:
         camera = JpegCamera("View1", [Path(name) for name in some])
         assert camera.time.tolist() == [float(Path(name).stem) for name in some]
@@ -171,3 +171,13 @@ def test_a_mode_that_cannot_be_shown_is_refused_by_name(tmp_path, monkeypatch):
     for look in (check_image, read_image):
         with pytest.raises(RecordingError, match="found mode 'L'"):
             look(path, str(path))
+
+
+@pytest.mark.parametrize("counts", [(0, 1, 2, 4, 5), (2, 3, 4), (100, 101, 110)])
+def test_frames_counted_with_a_gap_or_from_any_number_are_refused(tmp_path, counts):
+    (tmp_path / "View1").mkdir()
+    paths = [tmp_path / "View1" / f"zed_left_{count}.jpg" for count in counts]
+    with pytest.raises(RecordingError, match=f"frames counted from {counts[0]} to {counts[-1]}"):
+        JpegCamera("View1", paths)
+    seconds = [tmp_path / f"zed_left_{1761551500 + count}.jpg" for count in counts]
+    assert len(JpegCamera("View1", seconds).time) == len(counts)

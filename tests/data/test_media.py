@@ -19,12 +19,12 @@ from PIL import Image
 from pipeline.base.config import MediaLimits
 from pipeline.base.errors import RecordingError
 from pipeline.data.arrays import read_csv, read_npy, read_npz
-from pipeline.data.jpeg import JpegCamera, check_image, image_size, read_image
+from pipeline.data.jpeg import JpegCamera, check_image, read_image
 from pipeline.data.media import check_unpacked, opened_video
 from pipeline.data.recording import content_digest
 
 MEND = "Copy the file again, or leave the episode out"
-ASKED = (read_image, check_image, image_size)
+ASKED = (read_image, check_image)
 SMALL = MediaLimits(pixels=1000, array_bytes=2**20, ratio=1)
 
 SPECIAL = {

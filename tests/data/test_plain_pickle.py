@@ -269,3 +269,26 @@ def test_random_bytes_never_raise_anything_else(tmp_path):
             load_plain(path)
         except RecordingError as error:
             assert "data.pkl" in str(error)
+
+
+@pytest.mark.parametrize("content", [{10**5000: 1}, {"action": -(2**70)}])
+def test_no_integer_is_longer_than_64_bits(tmp_path, content):
+    path = tmp_path / "data.pkl"
+    path.write_bytes(pickle.dumps(content))
+    with pytest.raises(RecordingError, match="an integer of more than 64 bits"):
+        load(path, 2**30)
+    path.write_bytes(pickle.dumps([2**64 - 1, -(2**63)]))
+    assert load(path, 2**30) == [2**64 - 1, -(2**63)]
+
+
+def test_lists_that_a_few_bytes_name_a_million_times_are_refused(tmp_path):
+    nested: object = [0]
+    for _ in range(30):
+        nested = [nested, nested]
+    path = tmp_path / "data.pkl"
+    path.write_bytes(pickle.dumps({"action": nested}))
+    with pytest.raises(RecordingError, match="the same lists again and again"):
+        load(path, 2**30)
+    shared = ["a.jpg"] * 1000
+    path.write_bytes(pickle.dumps({"left": shared, "right": shared}))
+    assert load(path, 2**30) == {"left": shared, "right": shared}

@@ -193,3 +193,17 @@ def test_a_lost_metadata_file_is_a_bad_episode(folder):
     (folder / "metadata.json").unlink()
     (bad,) = open_recordings([Source(name="s", path=str(folder))], folder).bad
     assert "metadata.json" in bad.reason and "no such file" in bad.reason
+
+
+@pytest.mark.parametrize("sensor_hz", [65.0, 550.0, 6500.0])
+def test_a_sensor_rate_that_the_overlap_disproves_is_refused(
+    tmp_path, write, truth, only, sensor_hz
+):
+    folder = write.new(tmp_path / "T" / "e", truth, 65, 13)
+    write.edit_json(folder / "metadata.json", sensor_hz=sensor_hz)
+    with pytest.raises(
+        RecordingError, match=rf"65\d(\.\d)? Hz.*sensor_hz.*{sensor_hz:g}; they must"
+    ):
+        only(folder).sensor()
+    write.edit_json(folder / "metadata.json", sensor_hz=630.0)
+    assert only(folder).sensor() is not None

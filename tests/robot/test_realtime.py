@@ -857,3 +857,10 @@ class TestThreads:
 def test_running_a_robot_needs_no_torch() -> None:
     code = "import sys, pipeline.robot.realtime; sys.exit('torch' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code]).returncode == 0
+
+
+def test_readings_that_cannot_be_checked_are_kept_from_the_recording() -> None:
+    values = np.array([[0.1, None], [0.1, None]], object)
+    arm, diary = Arm(after(9, put("state", values))), Diary()
+    stopped(arm, StopKind.LOOP, "check", recorder=diary)
+    assert len(diary.ticks) == 9

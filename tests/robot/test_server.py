@@ -362,3 +362,8 @@ def test_a_robot_counts_until_its_observation_is_answered_though_it_has_left(
     with pytest.raises(ConnectionError, match="busy: 1 robots"):
         client_of(server)
     go.set()
+
+
+def test_a_foreign_host_is_told_of_the_token(served_policy: Served, serving: Serving) -> None:
+    _, body, *_ = get(serving(served_policy()), "/status.json", Host="robot.lab:8000")
+    assert "robot.lab:8000" in str(body) and "serve.token_file" in str(body)

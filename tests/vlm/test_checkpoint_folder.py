@@ -75,9 +75,9 @@ ROPE = "text_config.rope_parameters"
         ),
         (CONFIG, "text_config.hidden_act", [], r"config\.json: cannot be read .*hidden_act"),
         (CONFIG, "image_token_id", -1, r"config\.json.* cannot be read: OverflowError"),
-        (PIXELS, "image_mean", [0.5], "cannot be read: ValueError"),
-        (PIXELS, "image_std", [0, 1, 1], r"image_std, .*above 0, found .*\(0, 1, 1\)"),
-        (PIXELS, "rescale_factor", None, "scales above 0, found .*None"),
+        (PIXELS, "image_mean", [0.5], r"image_mean\.1: missing"),
+        (PIXELS, "image_std", [0, 1, 1], r"image_std\.0: expected greater than 0, found 0"),
+        (PIXELS, "rescale_factor", None, "rescale_factor: expected a valid number, found None"),
         (PIXELS, "resample", 2, "expected resample 3, found 2"),
         (PIXELS, "do_resize", False, "expected do_resize True, found False"),
         (PIXELS, "image_processor_type", "CLIP", "image_processor_type .*found 'CLIP'"),
@@ -255,3 +255,53 @@ def test_what_the_hub_and_older_versions_write_is_read(folder: Path) -> None:
         assert PixelSettings.read(folder, (360, 640)).image_size == (364, 644)
     _edit(folder / PIXELS, "max_pixels", 100_000)
     assert PixelSettings.read(folder, (360, 640)).image_size == (224, 420)
+
+
+@pytest.mark.parametrize(
+    ("name", "place", "value", "told"),
+    [
+        ("preprocessor_config.json", "max_pixels", "x", r"longest_edge: .* found 'x'"),
+        ("preprocessor_config.json", "max_pixels", [1], r"longest_edge: .* found \[1\]"),
+        ("preprocessor_config.json", "max_pixels", 0, "longest_edge: .* found 0"),
+        ("preprocessor_config.json", "min_pixels", 10**400, "shortest_edge: expected"),
+        ("preprocessor_config.json", "patch_size", 14.0, "patch_size: .* found 14.0"),
+        ("preprocessor_config.json", "image_std", ["1", "1", "1"], "image_std.0: .* found '1'"),
+        ("processor_config.json", "image_processor", [1], "image_processor: expected an object"),
+        ("processor_config.json", "image_processor", {"patch_size": 14.0}, "patch_size: .* 14.0"),
+    ],
+)
+def test_pixel_settings_of_a_wrong_type_are_refused_in_their_file(
+    demo_checkpoint: Path, tmp_path: Path, name: str, place: str, value: object, told: str
+) -> None:
+    path = shutil.copytree(demo_checkpoint, tmp_path / "vlm") / name
+    document = json.loads(path.read_text()) if path.exists() else {}
+    path.write_text(json.dumps(document | {place: value}))
+    with pytest.raises(VLMError, match=rf"/{name}: .*{told}"):
+        PixelSettings.read(path.parent, (112, 140))
+
+
+@pytest.mark.parametrize(
+    ("part", "key"),
+    [
+        *(("text_config", key) for key in ("hidden_size", "num_hidden_layers", "rms_norm_eps")),
+        ("text_config", "max_position_embeddings"),
+        *(("vision_config", key) for key in ("num_heads", "fullatt_block_indexes")),
+    ],
+)
+def test_a_config_without_a_value_that_decides_features_is_refused(
+    demo_checkpoint: Path, tmp_path: Path, part: str, key: str
+) -> None:
+    path = shutil.copytree(demo_checkpoint, tmp_path / "vlm") / "config.json"
+    document = json.loads(path.read_text())
+    del document[part][key]
+    path.write_text(json.dumps(document))
+    with pytest.raises(VLMError, match=rf"config\.json: {part}.*(: missing|{key})"):
+        read_config(path.parent)
+
+
+def test_no_tokenizer_file_of_another_folder_is_read(demo_checkpoint: Path, tmp_path: Path) -> None:
+    path = shutil.copytree(demo_checkpoint, tmp_path / "vlm") / "tokenizer_config.json"
+    elsewhere = {"fast_tokenizer_files": ["../other/tokenizer.4.0.0.json"]}
+    path.write_text(json.dumps(json.loads(path.read_text()) | elsewhere))
+    with pytest.raises(VLMError, match=r"fast_tokenizer_files: .*\.\./other"):
+        PromptRenderer(path.parent, "{instruction}{images}")

@@ -1,23 +1,27 @@
 """Whether the recordings are there and can be read."""
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
+
+import numpy as np
 
 from pipeline.base.commands import command
 from pipeline.base.config import MediaLimits, Params, Source
 from pipeline.base.errors import RecordingError
 from pipeline.base.issue import Issue
-from pipeline.data import Opened, open_recordings
+from pipeline.data import Opened, Recording, open_recordings
 from pipeline.data.media import DEFAULT_LIMITS, opened_video
 from pipeline.look.doctor import missing, note, ok
 
 _WHEEL = "pip install --upgrade --force-reinstall --only-binary av av"
+_EPISODES = 4
+"""Read of each source."""
 _VIDEOS = {".mp4", ".mkv", ".avi", ".mov", ".webm"}
 
 
 def check_recordings(params: Params) -> Iterator[Issue]:
-    """`data.root` and each source; metadata is read, and one frame of a video."""
+    """`data.root` and each source; metadata is read, a few episodes, and one frame of a video."""
     data = params.data
     demo = f"{command('demo')} (or dvc repro)" if data.root == params.demo.recordings else ""
     relative = any(not Path(path).is_absolute() for source in data.sources for path in source.paths)
@@ -40,8 +44,8 @@ def check_source(source: Source, opened: Opened, on_bad: str) -> Iterator[Issue]
     formats = Counter(recording.format for recording in opened.recordings)
     text = ", ".join(f"{count} episode(s), {name}" for name, count in formats.items())
     yield ok(source.name, text or "no episode")
-    if opened.bad:
-        first = f"{len(opened.bad)} episode(s) cannot be read, first: {opened.bad[0].reason}"
+    if bad := [*(bad.reason for bad in opened.bad), *_unreadable(opened.recordings)]:
+        first = f"{len(bad)} episode(s) cannot be read, first: {bad[0]}"
         if on_bad == "skip":
             yield note(source.name, first, "left out, as data.on_bad_episode says")
         else:
@@ -54,6 +58,20 @@ def check_source(source: Source, opened: Opened, on_bad: str) -> Iterator[Issue]
     videos = [file for episode in lerobot[:1] for file in episode.files() if file.suffix in _VIDEOS]
     if videos:
         yield check_video(source.name, videos[0], source.limits)
+
+
+def _unreadable(recordings: Sequence[Recording]) -> Iterator[str]:
+    """Why those of a few evenly spread ones cannot be read that cannot."""
+    spread = np.linspace(0, len(recordings) - 1, min(_EPISODES, len(recordings)))
+    for recording in (recordings[int(place)] for place in spread):
+        try:
+            motion = recording.poses if recording.has_poses else recording.action
+            for read in (recording.state, recording.sensor, motion):
+                read()
+            for camera in recording.cameras().values():
+                camera.check(range(min(1, len(camera.time))))
+        except RecordingError as error:
+            yield str(error)
 
 
 def check_video(source: str, path: Path, limits: MediaLimits = DEFAULT_LIMITS) -> Issue:

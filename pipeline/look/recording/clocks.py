@@ -40,6 +40,8 @@ _BURSTS = 0.5
 _LONGEST = 0.02
 # Seconds between the ticks of an episode without two.
 _TICK_S = 0.1
+# Share of entries that have the time of the one before, above which it is told.
+REPEATED = 0.05
 # Steps from which frames can be called dropped.
 _FEWEST = 20
 
@@ -168,7 +170,7 @@ def _merge_equal(clocks: Iterable[Clock]) -> list[Clock]:
 
 
 def find_clock_issues(view: EpisodeView) -> Iterator[Issue]:
-    """Issues of kind gap, clock jump, dropped frames and lost ticks.
+    """Issues of kind gap, clock jump, repeated times, dropped frames and lost ticks.
 
     A gap shorter than a tick is no issue: no tick loses a reading by it.
     """
@@ -178,6 +180,10 @@ def find_clock_issues(view: EpisodeView) -> Iterator[Issue]:
             if gap.length_s > _tick_s(view):
                 kind, message = _describe_gap(view, clock, gap, recorded)
                 yield view.issue(kind, clock.name, message, *gap)
+        still = int(np.count_nonzero(np.diff(clock.time) == 0))
+        if still > REPEATED * (len(clock.time) - 1):
+            message = f"{still} of {len(clock.time)} entries have the time of the entry before"
+            yield view.issue("repeated times", clock.name, message)
         if clock.kind == "camera":
             yield from _dropped(view, clock)
     yield from _lost_ticks(view, recorded)

@@ -6,7 +6,7 @@ same episode, so they expect nothing of the robot.
 """
 
 import re
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -143,6 +143,7 @@ def survey_recordings(opened: Opened, params: Params) -> RecordingsOverview:
             kind = Embodiment.of(line.action_channels, line.action_kind, view.sensor, view.state)
             embodiments.append((recording, kind))
             rates.append((recording.source, line.recorded_hz, line.fastest_hz))
+    _warn_of_missing(summaries)
     _warn_of_duplicates(summaries)
     common = list(_not_opened(opened))
     try:
@@ -211,6 +212,24 @@ def _missing(view: EpisodeView, nominal: Nominal) -> Iterator[Issue]:
         yield view.issue("missing", "cameras", message)
     for name in empty:
         yield view.issue("missing", f"view {name}", "its folder is there and holds no frame")
+
+
+def _warn_of_missing(summaries: Sequence[RecordingSummary]) -> None:
+    """Warn of what most episodes of a source and format have, where no other issue tells of it."""
+    alike: dict[tuple[str, str], list[RecordingSummary]] = defaultdict(list)
+    for summary in summaries:
+        alike[summary.source, summary.format].append(summary)
+    for group in alike.values():
+        held = Counter(name for summary in group for name in summary.counts)
+        usual = {name for name, count in held.items() if 2 * count > len(group)}
+        for summary in group:
+            told = {name for issue in summary.issues for name in issue.stream.split(", ")}
+            told |= {name for name in usual if name.startswith("view ") and "cameras" in told}
+            told |= {"poses"} & usual if "state" in told else set()  # its columns
+            if lacking := sorted(usual - summary.counts.keys() - told):
+                message = "not there; most episodes of this source have it"
+                place = summary.source, summary.episode, ", ".join(lacking)
+                summary.issues.append(_warning("missing", message, *place))
 
 
 def _digest_motion(view: EpisodeView) -> dict[str, str]:

@@ -1,5 +1,6 @@
 """Recordings: there, absent, broken, in a codec that is not decoded."""
 
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -75,3 +76,12 @@ def test_a_video_that_is_not_decoded_is_missing(tmp_path: Path) -> None:
     assert (good.severity, good.message) == ("ok", "its videos are av1")
     (tmp_path / "cut.mp4").write_bytes(video.read_bytes()[:40])
     assert check_video("cameras", tmp_path / "cut.mp4").severity == "error"
+
+
+def test_an_episode_whose_arrays_are_cut_off_is_told(recordings: Path, tmp_path: Path) -> None:
+    root = Path(shutil.copytree(recordings / "raw", tmp_path / "raw"))
+    path = sorted(root.rglob("sensor_data*.npz"))[-1]
+    path.write_bytes(path.read_bytes()[:-2000])
+    *_, issue = check_recordings(params(tmp_path, {"name": "raw", "path": "raw"}))
+    assert issue.severity == "error" and "1 episode(s) cannot be read" in issue.message
+    assert path.name in issue.message

@@ -118,3 +118,10 @@ def test_frames_that_are_lost_have_a_place(find: Find) -> None:
     assert issue.kind == "dropped frames"
     assert issue.start_s is not None and issue.stop_s is not None
     assert (issue.start_s, issue.stop_s) == pytest.approx((0.4, 57.1))
+
+
+def test_times_that_repeat_are_told(find: Find) -> None:
+    time = np.arange(0, 30, 0.01)
+    (issue,) = find({"sensor": np.repeat(time[::2], 2), "state": time})
+    assert (issue.kind, issue.stream) == ("repeated times", "sensor")
+    assert issue.message == "1500 of 3000 entries have the time of the entry before"

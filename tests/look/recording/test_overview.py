@@ -180,3 +180,14 @@ def test_the_choice_spreads_over_sound_episodes(healthy: Path) -> None:
     assert found.choose(1) == (8,) and found.choose(2) == (3, 8)
     assert found.choose(5) == (0, 3, 7, 8, 10)
     assert np.array_equal(found.choose(99), np.arange(11))
+
+
+def test_a_view_that_most_episodes_have_is_missed(many: Path) -> None:
+    content = pickle.loads((many / "b" / "data.pkl").read_bytes())
+    view = max(content["image"])
+    del content["image"][view]
+    (many / "b" / "data.pkl").write_bytes(pickle.dumps(content))
+    (issue,) = survey(Source(name="s", path=str(many / "*"))).issues
+    assert (issue.severity, issue.kind, issue.episode) == ("warning", "missing", "b")
+    assert issue.stream.startswith("view ")
+    assert issue.message == "not there; most episodes of this source have it"
