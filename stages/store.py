@@ -114,10 +114,10 @@ def _gc(params: "StoresParams") -> None:
             print(f"kept: {line}")
     locked: list[PipelineError] = []
     for entry in leftovers:
-        word, why = "removed" if params.remove else "unneeded", fate_of(entry)[1]
+        word, (fate, why) = "removed" if params.remove else "unneeded", fate_of(entry)
         try:
-            if params.remove:
-                remove_entry(entry)
+            if params.remove and not remove_entry(entry, fate):
+                continue
             print(f"{word}: {entry.path}, {size(entry.bytes)}: {why}")
         except StoreLocked as error:
             locked.append(error)

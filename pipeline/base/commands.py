@@ -7,7 +7,13 @@ from contextlib import contextmanager
 from pathlib import Path
 
 DEFAULT_PARAMS = Path("params.yaml")
-_NOT_REPEATED = ("extract.plan", "train_head.anew")
+_NOT_REPEATED = (
+    "extract.plan",
+    "train_head.anew",
+    "stores.remove",
+    "verify.repair",
+    "archive.restore",
+)
 """Keys that concern the running command alone."""
 _repeated: list[str] = []
 """Options of the running command that the next one needs too; one list, for threads read it."""
@@ -16,7 +22,11 @@ _repeated: list[str] = []
 @contextmanager
 def running_with(params: Path, overrides: Sequence[str]) -> Generator[None]:
     """Inside, `command` repeats this params file and these `section.key=value` settings."""
-    latest = {override.partition("=")[0]: override for override in overrides}
+    latest: dict[str, str] = {}
+    for override in overrides:
+        key = override.partition("=")[0]
+        latest.pop(key, None)  # what is set last stands last
+        latest[key] = override
     settings = [f"--set {shlex.quote(o)}" for key, o in latest.items() if key not in _NOT_REPEATED]
     file = [] if params == DEFAULT_PARAMS else [f"--params {shlex.quote(str(params))}"]
     before, _repeated[:] = list(_repeated), [*file, *settings]

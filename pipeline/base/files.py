@@ -194,7 +194,7 @@ def put_in_place(complete: Path, target: Path, kind: OutputKind) -> None:
     refuse_foreign(target, kind)
     unmark(complete)
     if there(target):
-        target.rename(complete / _REPLACED)
+        target.rename(complete / REPLACED)
     complete.rename(target)
     sync(target.parent)
     recover(complete, target, kind)
@@ -206,15 +206,19 @@ def recover(complete: Path, target: Path, kind: OutputKind) -> None:
     Raises `ConfigError` where what lies at `target` is not of this kind.
     """
     refuse_foreign(target, kind)
-    if there(complete / _REPLACED) and not there(target):
-        (complete / _REPLACED).rename(target)
+    if there(complete / REPLACED) and not there(target):
+        (complete / REPLACED).rename(target)
+    elif (complete / REPLACED).is_symlink():  # the user has put another one back
+        (complete / REPLACED).unlink()
+    else:
+        remove_folder(complete / REPLACED, kind)
     if HELD.marks(earlier := _beside(target, "replaced")):
         if there(earlier / target.name) and not there(target):
             (earlier / target.name).rename(target)
         remove_folder(earlier, HELD)
-    if (target / _REPLACED).is_symlink():
-        (target / _REPLACED).unlink()
-    remove_folder(target / _REPLACED, kind)
+    if (target / REPLACED).is_symlink():
+        (target / REPLACED).unlink()
+    remove_folder(target / REPLACED, kind)
 
 
 REPORT = OutputKind(
@@ -224,7 +228,8 @@ REPORT = OutputKind(
 """What evaluations, inspections, probes, comparisons and trainings show; it keeps its marker."""
 HELD = OutputKind("a folder that is being replaced,")
 """What earlier versions put the old folder into, as `<name>.replaced`."""
-_REPLACED = ".replaced"
+REPLACED = ".replaced"
+"""Where the old folder lies in the new one until it is removed."""
 
 
 def _is_empty(folder: Path) -> bool:

@@ -39,6 +39,7 @@ from pipeline.base.files import (
     begin_folder,
     disk_full_named,
     put_in_place,
+    refuse_foreign,
     remove_folder,
     sync,
 )
@@ -208,6 +209,7 @@ def archive(store: Path, output: Path, level: int, threads: int) -> Manifest | N
                 f"{output}: there already, and not an archive of {store} as it is now. Move it "
                 "away, or name another place with archive.output."
             )
+        refuse_foreign(output, ARCHIVE)  # a link to nothing
         check_trailers(store)
         read_golden(store, opened.array(KEYS))
         with _begun(output, ARCHIVE, threads) as part:

@@ -28,7 +28,14 @@ from pipeline.store.archive import ARCHIVE, is_archive, read_manifest
 from pipeline.store.border import StoreAttributes
 from pipeline.store.chunks import read_rows
 from pipeline.store.lock import build_lock, lock_holder
-from pipeline.store.paths import KEPT, STORE, is_store, laid_out_attributes
+from pipeline.store.paths import (
+    ASIDE_METADATA,
+    KEPT,
+    KNOWN,
+    STORE,
+    is_store,
+    laid_out_attributes,
+)
 from pipeline.store.reader import FeatureStore
 from pipeline.store.repair_hints import gc_command
 from pipeline.store.schema import CHECKSUMS, FEATURES, ArraySpec, read_spec, read_specs
@@ -131,6 +138,8 @@ def fate_of(entry: StoreEntry) -> tuple[Fate, str]:
         return "by name", "the store before, kept until the next successful run"
     if done:
         return "by name", f"unfinished build with {done} feature rows; the same command goes on"
+    if any(path.glob(f"{KNOWN}/*/{ASIDE_METADATA}")):
+        return "by name", "unfinished build that a kill stopped in a move; the same command goes on"
     return "unneeded", "a build that was stopped before any row was done"
 
 
@@ -163,23 +172,24 @@ def describe_kept(entries: Sequence[StoreEntry]) -> list[str]:
     return lines
 
 
-def remove_entry(entry: StoreEntry) -> None:
-    """Remove an entry, unless it may no longer be; takes the lock of its store meanwhile.
+def remove_entry(entry: StoreEntry, fate: Fate) -> bool:
+    """Remove an entry if its fate is still this one; whether it was removed.
 
-    Raises `StoreLocked` where a build has begun since.
+    Takes the lock of its store meanwhile. Raises `StoreLocked` where a build has begun since.
     """
     path, lock = entry.path, entry.base.with_name(entry.base.name + ".lock")
     there = lock.exists()
     try:
         with build_lock(entry.base):
-            if fate_of(entry)[0] == "kept":
-                return
+            if fate_of(entry)[0] != fate:
+                return False
             if path.is_dir():
                 remove_folder(path, _owner(path) or STORE)
             else:
                 path.unlink(missing_ok=True)
             if not there:
                 lock.unlink(missing_ok=True)
+            return True
     except StoreLocked as error:
         raise StoreLocked(f"{path}: not removed. {error}") from None
 

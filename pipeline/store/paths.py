@@ -57,7 +57,7 @@ from pipeline.store.schema import SCHEMA
 MERGED = "merge-"
 """How the plan of a store begins that was not extracted but merged."""
 
-_MOVED_LAST = ".zarr.json"
+ASIDE_METADATA = ".zarr.json"
 """What `set_build_aside` calls the metadata of a build until the rest of it has moved."""
 Inode = tuple[int, int]
 
@@ -93,9 +93,18 @@ KEPT = OutputKind("a store of before, kept for its rows,", _is_kept_link)
 
 
 def refuse_foreign_store(target: Path) -> None:
-    """Raise `ConfigError` where what lies at a store's place or its build's is neither."""
+    """Raise `ConfigError` where what lies at a store's place or its build's is neither.
+
+    Nor may a build lie behind a link: what replaces a store is renamed, on one file system.
+    """
     for place in (target, part_path(target)):
         refuse_foreign(place, STORE)
+    if (part := part_path(target)).is_symlink():
+        raise ConfigError(
+            f"{part}: expected the unfinished build itself, found a link to "
+            f"{os.path.realpath(part)}. Move it back, or move the whole folder {target.parent} to "
+            "the larger disk and link that."
+        )
 
 
 def recover(target: Path) -> None:
@@ -116,10 +125,12 @@ def recover(target: Path) -> None:
         unmark(target)
     files.recover(part, target, STORE)
     remove_folder(target / KNOWN, STORE)
+    if KEPT.marks(previous := previous_path(target)) and not (previous / "zarr.json").exists():
+        remove_folder(previous, KEPT)  # half removed
     for left in sorted(target.parent.glob(f"{glob.escape(target.name)}.known-*")):
         if left.name.rpartition("-")[2].isdigit() and is_store(left):  # of earlier versions
             left.rename(_place_aside(part))
-    for moving in part.glob(f"{KNOWN}/*/{_MOVED_LAST}"):
+    for moving in part.glob(f"{KNOWN}/*/{ASIDE_METADATA}"):
         _move_build(part, moving.parent)
 
 
@@ -133,7 +144,7 @@ def set_build_aside(target: Path) -> None:
     part = part_path(target)
     folder = _place_aside(part)
     folder.mkdir()
-    (part / "zarr.json").rename(folder / _MOVED_LAST)
+    (part / "zarr.json").rename(folder / ASIDE_METADATA)
     _move_build(part, folder)
 
 
@@ -156,12 +167,13 @@ def put_in_place(target: Path, keep: bool = False) -> None:
     """
     previous = previous_path(target)
     if keep and there(target):
+        if not target.is_symlink():
+            mark(target, KEPT)  # before the older one goes: a full disk may refuse it
         remove_folder(previous, KEPT)
         if target.is_symlink():
             previous.symlink_to(os.path.realpath(target) + _LINK_ENDS)
             target.unlink()
         else:
-            mark(target, KEPT)
             target.rename(previous)
     files.put_in_place(part_path(target), target, STORE)
     remove_folder(target / KNOWN, STORE)
@@ -178,7 +190,7 @@ def _move_build(part: Path, folder: Path) -> None:
     for entry in part.iterdir():
         if entry.name not in (MARKER, KNOWN):
             entry.rename(folder / entry.name)
-    (folder / _MOVED_LAST).rename(folder / "zarr.json")
+    (folder / ASIDE_METADATA).rename(folder / "zarr.json")
 
 
 def read_plan(store: Path) -> str | None:

@@ -28,3 +28,9 @@ def test_default_params_are_not_repeated_nor_is_anything_afterwards():
     with pytest.raises(KeyError), running_with(Path("lab.yaml"), []):
         raise KeyError
     assert command("demo") == "python -m stages.demo"
+
+
+def test_what_removes_is_not_repeated_and_what_is_set_last_stands_last() -> None:
+    settings = ["stores.remove=true", "a.b=1", "a={b: 2}", "a.b=3"]
+    with running_with(DEFAULT_PARAMS, settings):
+        assert command("store") == "python -m stages.store --set 'a={b: 2}' --set a.b=3"

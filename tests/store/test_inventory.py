@@ -24,8 +24,17 @@ from pipeline.store.inventory import (
     remove_entry,
 )
 from pipeline.store.metadata import note_metadata
-from pipeline.store.paths import KEPT, STORE, group_attributes, previous_path, set_build_aside
+from pipeline.store.paths import (
+    KEPT,
+    STORE,
+    group_attributes,
+    part_path,
+    previous_path,
+    recover,
+    set_build_aside,
+)
 from pipeline.store.schema import read_specs
+from pipeline.store.verification import strange_files
 
 Make = Callable[..., Path]
 HOLD = """
@@ -187,7 +196,7 @@ class TestLeftovers:
             "tiny.zarr.repair.part": stopped,
         }
         for one in found:
-            remove_entry(one)
+            remove_entry(one, fate_of(one)[0])
         assert sorted(os.listdir(tmp_path)) == ["tiny.zarr", "tiny.zarr.files.sqlite"]
         assert FeatureStore.open(tmp_path / "tiny.zarr").ticks == 180
 
@@ -217,7 +226,7 @@ class TestLeftovers:
             with pytest.raises(ConfigError, match=rf"{path}: .*Nothing was removed"):
                 find_named(entries, [begun, path])
         for one in find_named(entries, named):
-            remove_entry(one)
+            remove_entry(one, fate_of(one)[0])
         assert os.listdir(tmp_path) == ["tiny.zarr"]
 
     def test_a_build_that_was_set_aside_is_work(self, tiny_store: Make, tmp_path: Path) -> None:
@@ -234,12 +243,13 @@ class TestLeftovers:
         path = tiny_store(tmp_path)
         hold(path)
         (listed,) = find_named(list_stores(tmp_path), [tmp_path / "tiny.zarr.replaced"])
+        fate, _ = fate_of(listed)
         shutil.rmtree(path)
         assert unneeded(tmp_path) == []
         assert "the only copy of tiny.zarr" in describe_kept(list_stores(tmp_path))[0]
         with pytest.raises(ConfigError, match="the only copy"):
             find_named(list_stores(tmp_path), [listed.path])
-        remove_entry(listed)  # listed while the store was still there
+        remove_entry(listed, fate)  # listed while the store was still there
         assert listed.path.exists()
 
     def test_what_is_being_built_is_not_touched(self, tiny_store: Make, tmp_path: Path) -> None:
@@ -251,7 +261,7 @@ class TestLeftovers:
                 find_named(entries, [part])
             assert describe_kept(entries)[0].startswith(f"{part}: in use by process {process}")
             with pytest.raises(StoreLocked, match="not removed"):
-                remove_entry(listed)
+                remove_entry(listed, fate_of(listed)[0])
         assert part.exists()
 
     @pytest.mark.parametrize("damaged", [False, True])
@@ -273,7 +283,7 @@ class TestLeftovers:
 
         monkeypatch.setattr("pipeline.base.files.shutil.rmtree", killed)
         with pytest.raises(KeyboardInterrupt):
-            remove_entry(leftover)
+            remove_entry(leftover, fate_of(leftover)[0])
         assert any(part.iterdir())
         assert STORE.owns(part)
 
@@ -290,7 +300,7 @@ class TestLeftovers:
 
         monkeypatch.setattr("pipeline.base.files.shutil.rmtree", killed)
         with pytest.raises(KeyboardInterrupt):
-            remove_entry(leftover)
+            remove_entry(leftover, fate_of(leftover)[0])
         assert KEPT.owns(kept)
 
     @pytest.mark.parametrize("suffix", ["files.sqlite", "lock", "part", "previous"])
@@ -316,7 +326,50 @@ class TestLeftovers:
         (part / MARKER).write_text("a feature store\n")
         (part / "inside").symlink_to(outside)
         for one in unneeded(folder):
-            remove_entry(one)
+            remove_entry(one, fate_of(one)[0])
         assert not part.exists()
         assert outside.exists()
         assert (outside / "zarr.json").exists()
+
+
+def test_rows_of_a_build_that_was_being_set_aside_are_removed_by_name_only(
+    tiny_store: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A kill just after its metadata moved: no store is to be seen there."""
+    part = unfinish(tiny_store(tmp_path), 12)
+
+    def killed(*_: Path) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("pipeline.store.paths._move_build", killed)
+    with pytest.raises(KeyboardInterrupt):
+        set_build_aside(tmp_path / "tiny.zarr")
+    (build,) = (entry for entry in list_stores(tmp_path) if entry.path == part)
+    assert fate_of(build)[0] == "by name"
+    assert not remove_entry(build, "unneeded"), "its fate is another than when it was listed"
+    assert part.exists()
+
+
+def test_what_kills_left_of_replacements_goes(tiny_store: Make, tmp_path: Path) -> None:
+    target = tiny_store(tmp_path)
+    # The store was put back by hand after a kill had left it in the new one.
+    part = part_path(target)
+    begin_folder(part, STORE)
+    shutil.copytree(target, part / ".replaced")
+    # Another kill while the previous store was removed, its metadata first.
+    begin_folder(previous_path(target), KEPT)
+    (previous_path(target) / "chunk").touch()
+    recover(target)
+    assert not (part / ".replaced").exists()
+    assert not previous_path(target).exists()
+    # A third one while the old store was removed from inside the new one.
+    shutil.copytree(target, target / ".replaced")
+    assert not list(strange_files(target, read_specs(target), set(target.glob("golden/**/*"))))
+
+
+def test_a_build_behind_a_link_is_refused(tiny_store: Make, tmp_path: Path) -> None:
+    part = unfinish(tiny_store(tmp_path), 12)
+    part.rename(tmp_path / "elsewhere")
+    part.symlink_to(tmp_path / "elsewhere")
+    with pytest.raises(ConfigError, match=r"found a link to .*elsewhere\. Move it back"):
+        recover(tmp_path / "tiny.zarr")
