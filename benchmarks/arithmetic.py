@@ -1,10 +1,9 @@
-"""The tables of docs/arithmetic.md, from the schema and the FLOP count: nothing here is measured.
+"""The tables of docs/speed.md, from the schema and the FLOP count: nothing here is measured.
 
 python -c "from benchmarks.arithmetic import page; print(page())"
 """
 
 from collections.abc import Sequence
-from itertools import product
 
 from benchmarks.flops import PEAK_TFLOPS, RowCost
 from benchmarks.real_shape import real_config
@@ -19,8 +18,6 @@ DIM = 2048
 EPISODE_TICKS, EPISODE_TEXT_BYTES = 300, 300
 IMAGE_SIZE, TEXT_TOKENS = (364, 644), 40
 MFU = 0.55
-AMOUNTS = {"1 M": 10**6, "100 M": 10**8, "10 B": 10**10}
-"""Ticks."""
 
 _GRID_SLOTS = 16
 """Of a view."""
@@ -28,35 +25,7 @@ _GRID_SLOTS = 16
 
 def page() -> str:
     """Every table, in the order of the page."""
-    tables = (hours_table, flops_table, ceiling_table, bytes_table, whole_table, files_table)
-    return "\n\n".join(table() for table in tables)
-
-
-def hours_table() -> str:
-    """Hours of extraction by measured speed and number of GPUs."""
-    rows = [
-        [f"{speed}", f"{gpus}", *(_hours(ticks, speed * gpus) for ticks in AMOUNTS.values())]
-        for speed, gpus in product((10, 30, 100), (1, 8, 64))
-    ]
-    return _table(["rows/s a GPU", "GPUs", *(f"{name} ticks" for name in AMOUNTS)], rows)
-
-
-def flops_table() -> str:
-    """TFLOP of one row of the 3B model, by part."""
-    costs = {views: row_cost(views) for views in (3, 5)}
-    parts = [
-        [name.replace("_", " "), *(f"{cost.parts[name] / 1e12:.3f}" for cost in costs.values())]
-        for name in costs[3].parts
-        if name != "pooling"
-    ]
-    return _table(
-        ["TFLOP a row", *(f"{views} views" for views in costs)],
-        [
-            *parts,
-            ["**sum**", *(f"**{cost.total() / 1e12:.2f}**" for cost in costs.values())],
-            ["tokens a row", *(f"{cost.tokens}" for cost in costs.values())],
-        ],
-    )
+    return "\n\n".join(table() for table in (ceiling_table, bytes_table, whole_table))
 
 
 def ceiling_table() -> str:
@@ -79,17 +48,17 @@ def bytes_table() -> str:
     stores = {dtype: store_arrays(10**6, 1, 3, dtype, dtype) for dtype in ("float16", "float32")}
     slots = {"mean": 1, "mean + grid, 3 views": 49, "mean + grid, 5 views": 81}
     rows: list[list[str]] = []
-    for (name, count), dtype in product(slots.items(), stores):
+    for name, count in slots.items():
         assert count == 1 or (count - 1) % _GRID_SLOTS == 0
-        parts = store_arrays(10**6, count, 3, dtype, dtype)
-        rows.append(_bytes_row(f"features: {name}, {dtype}", parts["vl/features"].data_bytes))
+        parts = store_arrays(10**6, count, 3, "float16", "float16")
+        rows.append(_bytes_row(f"features: {name}, float16", parts["vl/features"].data_bytes))
     for dtype, parts in stores.items():
         rows.append(_bytes_row(f"sensor, {dtype}", _sum(parts, "sensor/")))
     rows.append(_bytes_row("state, float32", _sum(stores["float16"], "state/")))
     rest = sum(spec.data_bytes for spec in stores["float16"].values())
     rest -= sum(_sum(stores["float16"], part) for part in ("vl/features", "sensor/", "state/"))
     rows.append(_bytes_row("all else, 1 slot of 3 views (ticks, keys, checksums, times)", rest))
-    return _table(["part", "a tick", "an hour", *(f"{name} ticks" for name in AMOUNTS)], rows)
+    return _table(["part", "a tick", "an hour", "1 M ticks"], rows)
 
 
 def whole_table() -> str:
@@ -101,33 +70,7 @@ def whole_table() -> str:
     ):
         parts = store_arrays(10**6, slots, 5, dtype, dtype)
         rows.append(_bytes_row(name, sum(spec.data_bytes for spec in parts.values())))
-    return _table(["store", "a tick", "an hour", *(f"{name} ticks" for name in AMOUNTS)], rows)
-
-
-def files_table() -> str:
-    """Chunk files, and after how many ticks an array has more of them than one process may map."""
-    rows: list[list[str]] = []
-    for label, name, slots, dtype in (
-        ("sensor, float32", "sensor/values", 1, "float32"),
-        ("sensor, float16", "sensor/values", 1, "float16"),
-        ("features `mean`, float16", "vl/features", 1, "float16"),
-        ("features `mean, grid`, 3 views, float16", "vl/features", 49, "float16"),
-    ):
-        counts = [
-            f"{store_arrays(ticks, slots, 3, dtype, dtype)[name].chunk_count:,}"
-            for ticks in AMOUNTS.values()
-        ]
-        spec = store_arrays(10**9, slots, 3, dtype, dtype)[name]
-        a_tick = spec.shape[0] / 10**9
-        limit = MAX_MAP_COUNT * spec.chunk_rows / a_tick
-        chunk = f"{spec.chunk_rows:,} rows, {spec.chunk_bytes / 2**20:.0f} MiB"
-        rows.append([label, chunk, *counts, f"{limit / 1e6:,.1f} M"])
-    header = ["array", "a chunk", *(f"{name} ticks" for name in AMOUNTS), "65,530 files at (ticks)"]
-    return _table(header, rows)
-
-
-MAX_MAP_COUNT = 65_530
-"""Linux' default of vm.max_map_count."""
+    return _table(["store", "a tick", "an hour", "1 M ticks"], rows)
 
 
 def store_arrays(
@@ -158,7 +101,7 @@ def _sum(specs: dict[str, ArraySpec], prefix: str) -> int:
 
 def _bytes_row(name: str, of_a_million: int) -> list[str]:
     a_tick = of_a_million / 10**6
-    amounts = (a_tick * ticks for ticks in (3600 * ACTION_HZ, *AMOUNTS.values()))
+    amounts = (a_tick * ticks for ticks in (3600 * ACTION_HZ, 10**6))
     return [name, f"{a_tick:,.0f} B", *map(_size, amounts)]
 
 
@@ -168,13 +111,6 @@ def _size(count: float) -> str:
         if count < 1000:
             return f"{count:.3g} {unit}"
     return f"{count / 1000:,.3g} PB"
-
-
-def _hours(ticks: int, rows_per_s: int) -> str:
-    hours = ticks / REUSE / rows_per_s / 3600
-    if hours < 1:
-        return f"{60 * hours:.0f} min"
-    return f"{hours:,.1f} h" if hours < 1000 else f"{hours:,.0f} h"
 
 
 def _table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:

@@ -1,4 +1,4 @@
-"""The page of arithmetic says what the schema and the FLOP count say, and the sums add up."""
+"""The page on speed says what the schema and the FLOP count say, and the sums add up."""
 
 from pathlib import Path
 
@@ -7,7 +7,7 @@ import pytest
 from benchmarks import arithmetic
 from benchmarks.arithmetic import page, row_cost, store_arrays
 
-PAGE = Path(__file__).resolve().parents[2] / "docs" / "arithmetic.md"
+PAGE = Path(__file__).resolve().parents[2] / "docs" / "speed.md"
 
 
 @pytest.mark.parametrize("table", page().split("\n\n"), ids=lambda table: table.split("\n")[0])
@@ -23,12 +23,6 @@ def test_bytes_follow_the_formulas_of_the_page():
     assert sensor == ticks * 65 * (1026 * 4 + 8)
     state = sum(spec.data_bytes for name, spec in parts.items() if name.startswith("state/"))
     assert state == ticks * 10 * (12 * 4 + 8)
-
-
-def test_hours_follow_the_formula_of_the_page():
-    row = next(line for line in arithmetic.hours_table().split("\n") if "| 30 | 8 |" in line)
-    hours = 10**8 / 3 / (30 * 8) / 3600
-    assert f"{hours:.1f} h" in row
 
 
 def test_the_ceiling_is_the_share_of_the_peak():
