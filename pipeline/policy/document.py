@@ -83,6 +83,10 @@ class PolicyDocument(SourceDocument):
             if actual not in fitting:
                 any_of = " or ".join(sorted(map(shown, fitting)))
                 raise ValueError(f"{place}: expected {any_of}, found {shown(actual)}")
+        for anchor in shape.anchors:
+            pairs = ((anchor.action, shape.action_dim), (anchor.state, shape.state_dim))
+            if any(channel >= size for channels, size in pairs for channel in channels):
+                raise ValueError(f"shape.anchors: expected channels that are there, found {anchor}")
         for stream, size in shape.channels.items():
             fitted = getattr(self.normalization, stream)
             actual = fitted and (fitted.mean.shape, fitted.std.shape)

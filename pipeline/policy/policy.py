@@ -11,6 +11,7 @@ from torch import Generator, Tensor, nn
 from pipeline.base.config import TrainHeadParams
 from pipeline.base.errors import ConfigError, ObservationError
 from pipeline.base.observation import Observation
+from pipeline.policy.anchoring import Anchoring
 from pipeline.policy.diffusion import DiffusionActionExpert
 from pipeline.policy.encoders import (
     FeatureEncoder,
@@ -151,6 +152,7 @@ class Policy(Trainable):
         expert = params.expert
         self.fusion = build_fusion(params.fusion_strategy, tokens, expert.dim, expert.heads)
         self.expert = build_expert(params, shape)
+        self.anchoring = Anchoring(shape.anchors, shape.kinds)
         self.drop_rates = {name: float(getattr(params, f"drop_{name}")) for name in self.encoders}
 
     @property
@@ -184,7 +186,7 @@ class Policy(Trainable):
         validity = self._validity(observation)
         if self.training and any(self.drop_rates.values()):
             validity = drop_streams(validity, self.drop_rates, generator)
-        target = self.action_normalizer.normalize(action)
+        target = self.action_normalizer.normalize(self.anchoring.from_frame(action, observation))
         context = self.context(observation, validity)
         return self.expert.loss(context, target, action_valid, generator)
 
@@ -205,10 +207,12 @@ class Policy(Trainable):
         context = self.context(observation)
         repeats = samples if self.stochastic else 1
         if guide is not None:
-            normalised = self.action_normalizer.normalize(guide.chunk)
+            anchored = self.anchoring.from_frame(guide.chunk, observation)
+            normalised = self.action_normalizer.normalize(anchored)
             guide = Guide(normalised, guide.weight).repeat(repeats)
         chunks = self.expert.act(context.repeat(repeats, 1, 1), generator, guide)
         physical = self.action_normalizer.invert(chunks).unflatten(0, (repeats, context.shape[0]))
+        physical = self.anchoring.from_tick(physical, observation)
         return physical.expand(samples, -1, -1, -1)
 
     def observe(
@@ -244,12 +248,18 @@ class Policy(Trainable):
         normalizer, encoder = self.normalizers[stream], self.encoders[stream]
         assert isinstance(normalizer, Normalizer)
         values = getattr(observation, stream)
+        if stream == "features":
+            values = normalizer.normalize(values).clamp_(-_LARGEST, _LARGEST)
+            return encoder(values, valid, observation.feature_age, observation.view_age)
+        ages = getattr(observation, AGES[stream])
         if stream == "state":
+            if self.shape.anchors:  # the older readings tell the motion since a frame
+                newest = min(values.shape[1], self.params.state_window)
+                values, ages = values[:, -newest:], ages[:, -newest:]
+                valid = valid.clamp(max=newest)
             values = expand(values, self.shape.kinds)
         values = normalizer.normalize(values).clamp_(-_LARGEST, _LARGEST)
-        if stream == "features":
-            return encoder(values, valid, observation.feature_age, observation.view_age)
-        return encoder(values, valid, getattr(observation, AGES[stream])).unsqueeze(1)
+        return encoder(values, valid, ages).unsqueeze(1)
 
     def _validity(self, observation: Observation) -> dict[str, Tensor]:
         return {name: getattr(observation, VALIDITY[name]) for name in self.encoders}

@@ -2,9 +2,11 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import ConfigDict, Field
+
+from pipeline.base.errors import ConfigError
 
 MOST = 1_000_000
 """Channels of a stream, slots or widths of features."""
@@ -18,6 +20,7 @@ Kind = Literal["plain", "deg", "rad", "rotation"]
 
 _POSE_ANGLES = ("pose_a", "pose_b", "pose_r")
 _ANGLES: dict[str, Kind] = {"deg": "deg", "rad": "rad"}
+_ROTVEC = ("rx", "ry", "rz")
 _SIX = tuple(f"rotation_{index}" for index in range(6))
 
 
@@ -40,6 +43,54 @@ def expanded_names(names: Sequence[str], kinds: Sequence[Kind]) -> list[str]:
 
 
 @dataclass(frozen=True)
+class Anchor:
+    """Action channels that count from the state when the newest frame was taken.
+
+    `state` are the channels of the state that tell their motion. `composed` is for a rotation
+    vector, which the three angles of the arm's pose tell; the others are added.
+    """
+
+    __pydantic_config__ = ConfigDict(strict=True, extra="forbid")
+
+    action: tuple[Size, ...]
+    state: tuple[Size, ...]
+    composed: bool = False
+
+
+def find_anchors(
+    action: Mapping[str, Any], state: Mapping[str, Any], wanted: Sequence[str]
+) -> tuple[Anchor, ...]:
+    """Which channels of the state tell the motion of these action channels, of a store's streams.
+
+    The delta `dx` is told by `x` or `pose_x` in the same unit, `joint_1` by `joint_1`; the rotation
+    vector `rx`, `ry`, `rz`, which is anchored whole, by the angles of the arm's pose. Raises
+    `ConfigError` naming a channel that is no such delta.
+    """
+    deltas = zip(action["names"], action["units"], strict=True) if action["kind"] == "delta" else ()
+    told = {name: place for name, unit in deltas if (place := _told(name, unit, state)) is not None}
+    whole = {*_ROTVEC} <= {*wanted} & {*action["names"]} and {*_POSE_ANGLES} <= {*state["names"]}
+    composed = _ROTVEC if whole and action["kind"] == "delta" else ()
+    if unknown := [name for name in wanted if name not in {*told, *composed}]:
+        raise ConfigError(
+            "train_head.anchor: expected deltas whose motion the state tells "
+            f"({', '.join(told) or 'this store has none'}), found {', '.join(unknown)}"
+        )
+    anchors = [Anchor((action["names"].index(n),), (told[n],)) for n in wanted if n in told]
+    if composed:
+        places = [(action, _ROTVEC), (state, _POSE_ANGLES)]
+        anchors.append(Anchor(*(tuple(map(s["names"].index, n)) for s, n in places), composed=True))
+    return tuple(anchors)
+
+
+def _told(name: str, unit: str, state: Mapping[str, Any]) -> int | None:
+    """The state's channel whose change a delta is."""
+    bare = name.removeprefix("delta_").removeprefix("d")
+    channels = list(zip(state["names"], state["units"], strict=True))
+    known = [(n, unit) for n in (name, bare, f"pose_{bare}") if (n, unit) in channels]
+    return channels.index(known[0]) if known else None
+
+
+@dataclass(frozen=True)
 class PolicyShape:
     """The widths that a store gives to a policy; 0 where the store lacks the stream.
 
@@ -59,6 +110,8 @@ class PolicyShape:
     """Views whose ages are inputs."""
     state_kinds: tuple[Kind, ...] = ()
     """Of each state channel; empty where all are plain."""
+    anchors: tuple[Anchor, ...] = ()
+    """Action channels that count from the newest frame; the others from the tick."""
 
     @property
     def kinds(self) -> tuple[Kind, ...]:
@@ -76,6 +129,10 @@ class PolicyShape:
             "state": (len(expanded),),
             "action": (self.action_dim,),
         }
+
+    def anchored(self, names: Sequence[str]) -> list[str]:
+        """The names of the action channels that count from the newest frame."""
+        return [names[channel] for anchor in self.anchors for channel in anchor.action]
 
     def stream_axes(self) -> dict[str, Axes]:
         """The axes behind the batch of each field of an `Observation` of this shape."""

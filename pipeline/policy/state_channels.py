@@ -27,7 +27,7 @@ def expand(
     angles = _of_kind(values, kinds, "deg", "rad") * values.new_tensor(degrees)
     parts += [angles.sin(), angles.cos()]
     if "rotation" in kinds:
-        matrices = _rotation(_of_kind(values, kinds, "rotation").deg2rad())
+        matrices = rotation_matrix(_of_kind(values, kinds, "rotation").deg2rad())
         relative = matrices[:, -1:].mT @ matrices
         parts.append(relative[..., :2].mT.flatten(2))
     return torch.cat(parts, dim=-1)
@@ -56,7 +56,7 @@ def _of_kind(values: Tensor, kinds: Sequence[Kind], *wanted: Kind) -> Tensor:
     return values[..., [place for place, kind in enumerate(kinds) if kind in wanted]]
 
 
-def _rotation(angles: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
+def rotation_matrix(angles: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
     """Rx(a)·Ry(b)·Rz(r) of (a, b, r) in radians."""
     (sa, sb, sr), (ca, cb, cr) = angles.sin().unbind(-1), angles.cos().unbind(-1)
     rows = [

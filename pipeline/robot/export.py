@@ -169,6 +169,7 @@ def describe(checkpoint: PolicyCheckpoint, folder: str, given: Inputs) -> dict[s
         "horizon": checkpoint.params.horizon,
         "inputs": [_input(checkpoint, name, value) for name, value in given.items()],
         "outputs": [outputs],
+        "anchored": checkpoint.shape.anchored(action["names"]),
         "guides": "not exported: real-time chunking (rtc) differentiates the head",
     }
 

@@ -92,7 +92,7 @@ def _drawn(
 ) -> NDArray[np.float64]:
     """Random values (row, slot or reading, channel) of a stream about its training mean."""
     statistics, shape = getattr(checkpoint.normalization, stream), checkpoint.shape
-    lengths = {"sensor": checkpoint.params.sensor_window, "state": checkpoint.params.state_window}
+    lengths = {"sensor": checkpoint.params.sensor_window, "state": checkpoint.params.state_readings}
     spread = statistics.std
     if stream == "state":
         plain = iter(spread)  # expanded states begin with the plain channels

@@ -65,7 +65,7 @@ class RobotMemory:
         params, shape = policy.params, policy.shape
         sizes = {
             "sensor": (params.sensor_window, shape.sensor_channels, params.sensor_reach_s),
-            "state": (params.state_window, shape.state_dim, params.state_window_s),
+            "state": (params.state_readings, shape.state_dim, params.state_reach_s),
         }
         return cls({name: ReadingWindow(*size) for name, size in sizes.items() if size[1]})
 

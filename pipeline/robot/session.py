@@ -151,6 +151,7 @@ class ServedPolicy:
             "vlm_reuse_count": source["vlm_reuse_count"],
             "horizon": params.horizon,
             "action_dim": self.policy.shape.action_dim,
+            "anchored": self.policy.shape.anchored(source["streams"]["action"]["names"]),
             "moving": list(moving_channels(source["streams"]["action"])),
             "model_type": params.model_type,
             "stochastic": self.policy.stochastic,
@@ -158,7 +159,7 @@ class ServedPolicy:
             "looks_at": list(self.policy.encoders),
             "instructions": list(self.checkpoint.instructions),
             "sensor_window": params.sensor_window,
-            "state_window": params.state_window,
+            "state_window": params.state_readings,
             "checkpoint": self._name,
             "step": self.checkpoint.step,
         }

@@ -7,10 +7,13 @@ are kept, sets of other params are replaced, and files that the demo did not wri
 touched.
 """
 
+import os
 from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor, as_completed
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
+from threading import Event
 from typing import Any, Final, Literal
 
 import numpy as np
@@ -75,21 +78,46 @@ def write_demo_recordings(root: Path, episodes: int, seed: int) -> None:
     with disk_full_named(root):
         root.mkdir(parents=True, exist_ok=True)
         _mark(root, wanted, finished)
-        with tqdm(total=4 * episodes, unit="episode", desc="simulating", disable=None) as progress:
-            for number, (name, write) in enumerate(_SETS.items()):
-                if name in finished:
-                    progress.update(episodes)
-                    continue
+        for name in _write_sets(root, finished, episodes, seed):
+            (root / f".{name}.part").rename(root / name)
+            finished.append(name)
+            _mark(root, wanted, finished)
+
+
+def _write_sets(root: Path, finished: list[str], episodes: int, seed: int) -> Iterator[str]:
+    """Write the sets that are not finished, a thread a core; the names, as they are written.
+
+    Threads are enough: compressing and drawing, which take the time, run side by side in them.
+    """
+    stop = Event()
+    missing = {name: number for number, name in enumerate(_SETS) if name not in finished}
+    total, done = len(_SETS) * episodes, len(finished) * episodes
+    with (
+        tqdm(None, "simulating", total, initial=done, unit="episode", disable=None) as progress,
+        ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool,
+    ):
+        writing: dict[Future[None], str] = {}
+        try:
+            for name, number in missing.items():
                 part = root / f".{name}.part"
                 remove_folder(part, _SET)
-                write(part, _simulated(number, episodes, seed, progress))
-                part.rename(root / name)
-                finished.append(name)
-                _mark(root, wanted, finished)
+                simulated = _simulated(number, episodes, seed, progress, stop)
+                writing[pool.submit(_SETS[name], part, simulated)] = name
+            for written in as_completed(writing):
+                written.result()
+                yield writing[written]
+        finally:
+            stop.set()
+            pool.shutdown(cancel_futures=True)
 
 
-def _simulated(number: int, episodes: int, seed: int, progress: "tqdm[Any]") -> Episodes:
+def _simulated(
+    number: int, episodes: int, seed: int, progress: "tqdm[Any]", stop: Event
+) -> Episodes:
+    """The episodes of a set, until `stop` is set."""
     for index in range(episodes):
+        if stop.is_set():
+            return
         own_seed = int(np.random.SeedSequence([seed, number, index]).generate_state(1)[0])
         fraction = np.random.default_rng(own_seed).uniform(0, 1)
         epoch_s = _FIRST_EPOCH_S + number * _BETWEEN_SETS_S + index * _BETWEEN_EPISODES_S + fraction

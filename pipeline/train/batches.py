@@ -89,9 +89,9 @@ class Windows:
         return cls(
             params.horizon,
             params.sensor_window if params.sensor_enabled else 1,
-            params.state_window if params.robot_state_enabled else 1,
+            params.state_readings if params.robot_state_enabled else 1,
             params.sensor_reach_s,
-            params.state_window_s,
+            params.state_reach_s,
         )
 
 

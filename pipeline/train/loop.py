@@ -98,7 +98,7 @@ class Trainer:
         else:
             fitted = partial(fit_normalization, store, split.train, self.windows)
             self.normalization = self.processes.shared(fitted)
-            self.shape = policy_shape(store, self.normalization)
+            self.shape = policy_shape(store, self.normalization, params.anchor)
             self._build()
 
     def _build(self) -> None:

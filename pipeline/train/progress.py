@@ -141,6 +141,8 @@ def describe_data(
         f"split: {len(split.train)} training ticks, {len(split.val)} val, {len(split.test)} test "
         f"of {' + '.join(str(len(names)) for names in groups)} groups{cut}",
     ]
+    if anchored := shape.anchored(store.streams["action"]["names"]):
+        lines.append(f"anchored at the newest frame: {', '.join(anchored)}")
     if not len(split.test):
         lines.append("split: nothing is test, so nothing is left for stages.evaluate to report on")
     if split.note:

@@ -39,7 +39,7 @@ from pipeline.base.source import SourceDocument
 from pipeline.policy.checkpoint import CHECKPOINT, DOCUMENT, SOURCE_KEYS, check_policy
 from pipeline.policy.document import PolicyDocument
 from pipeline.policy.normalization import Normalization
-from pipeline.policy.shape import PolicyShape, channel_kinds
+from pipeline.policy.shape import PolicyShape, channel_kinds, find_anchors
 from pipeline.store import FeatureStore, build_lock
 from pipeline.train.training_data import list_differences, source_of
 
@@ -267,8 +267,10 @@ def recordings_of(store: FeatureStore) -> dict[str, Any]:
     return {"episodes": len(episodes), "ticks": store.ticks, "digest": digest.hexdigest()}
 
 
-def policy_shape(store: FeatureStore, normalization: Normalization) -> PolicyShape:
-    """The widths that this store gives to a policy.
+def policy_shape(
+    store: FeatureStore, normalization: Normalization, anchor: Sequence[str] = ()
+) -> PolicyShape:
+    """The widths that this store gives to a policy, and which action channels are anchored.
 
     A stream without statistics is absent from the training ticks, so it has width 0.
     """
@@ -281,6 +283,7 @@ def policy_shape(store: FeatureStore, normalization: Normalization) -> PolicySha
         action_groups=action_groups(action["names"], action["units"]),
         views=store.array("vl/frame_time").shape[1],
         state_kinds=channel_kinds(state["names"], state["units"]) if normalization.state else (),
+        anchors=find_anchors(action, state, anchor),
     )
 
 

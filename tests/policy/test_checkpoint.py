@@ -30,6 +30,7 @@ from pipeline.policy.checkpoint import (
     save_policy,
 )
 from pipeline.policy.policy import Policy
+from pipeline.policy.shape import Anchor
 from pipeline.store import FeatureStore
 from pipeline.train.batches import Windows
 from pipeline.train.run import policy_shape
@@ -344,3 +345,13 @@ class TestGoldenRows:
         write_with_digest(tmp_path / "best/policy.json", document)
         with pytest.raises(CheckpointMismatch, match=rf"golden\.safetensors does not fit.*{name}"):
             load_policy(tmp_path / "best")
+
+
+def test_anchors_travel(checkpoint: PolicyCheckpoint, tmp_path: Path) -> None:
+    shape = replace(checkpoint.shape, anchors=(Anchor((0,), (1,)),))
+    save_policy(tmp_path / "policy", replace(checkpoint, shape=shape))
+    assert load_policy(tmp_path / "policy").shape == shape
+    shape = replace(shape, anchors=(Anchor((0,), (12,)),))
+    save_policy(tmp_path / "wrong", replace(checkpoint, shape=shape))
+    with pytest.raises(CheckpointIncomplete, match=r"policy\.json: .*shape\.anchors: expected"):
+        load_policy(tmp_path / "wrong")

@@ -1,5 +1,6 @@
 """Sections of training, of tuning the vision-language model itself, and of evaluation."""
 
+import math
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -108,6 +109,13 @@ class TrainHeadParams(Section):
     feature_lag: int = Field(default=0, ge=0, le=1000)
     """Most VL rows that features come late in training, drawn evenly for each sample: so a policy
     learns what a slow model does to it."""
+    anchor: tuple[str, ...] = ()
+    """Action channels that count from where the arm was when the newest frame was taken, such as
+    `[dx, dy]`: what vision tells stays true when the model is late. They are deltas whose motion
+    the state tells."""
+    anchor_s: float = Field(default=2.0, gt=0, le=3600)
+    """Seconds back that the motion since a frame is known; a frame that is older counts as so old.
+    """
     sensor_lag_s: float = Field(default=0.0, ge=0, le=3600)
     """Most seconds that the sensor comes late in training, likewise; its window then reaches back
     as much further."""
@@ -188,10 +196,33 @@ class TrainHeadParams(Section):
     wandb_project: str = "vla-feature-cache"
     """Where Weights & Biases puts the run; its own environment variables decide the rest."""
 
+    @model_validator(mode="after")
+    def _anchor_has_what_it_needs(self) -> "TrainHeadParams":
+        if self.anchor and not (self.features_enabled and self.robot_state_enabled):
+            raise ValueError(
+                "anchor counts from the newest frame by the state's motion: enable features and "
+                "robot state, or set anchor to []"
+            )
+        return self
+
     @property
     def sensor_reach_s(self) -> float | None:
         """Seconds before the tick of the oldest reading that the sensor's encoder looks at."""
         return None if self.sensor_window_s is None else self.sensor_window_s + self.sensor_lag_s
+
+    @property
+    def state_reach_s(self) -> float | None:
+        """Seconds before the tick of the oldest state that is looked at."""
+        if self.state_window_s is None or not self.anchor:
+            return self.state_window_s
+        return max(self.state_window_s, self.anchor_s)
+
+    @property
+    def state_readings(self) -> int:
+        """Most readings of the state before the tick, as dense as those of `state_window`."""
+        if self.state_window_s is None or self.state_reach_s is None:
+            return self.state_window
+        return math.ceil(self.state_window * self.state_reach_s / self.state_window_s)
 
 
 class EvaluateParams(Section):

@@ -1,0 +1,120 @@
+"""Chunks that count from the newest frame: what was seen stays true while the model is late.
+
+What vision tells, such as the way to a target, is true of the time of the frame. So anchored
+channels of a chunk count from the state at that time: in training the first step has the motion
+since then added, and the policy's answer has the measured motion subtracted. A late frame then
+names the same place. The steps behind the first count from the step before, as ever.
+
+The state is interpolated on its own clock, between the readings of its window; before the first of
+them the arm is taken to have stood where that says.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from pipeline.base.observation import Observation
+from pipeline.policy.shape import Anchor, Kind
+from pipeline.policy.state_channels import rotation_matrix
+
+Chunks = Float[Tensor, "*sample batch horizon action"]
+_FULL_TURN: dict[Kind, float] = {"deg": 360.0, "rad": 2 * torch.pi, "rotation": 360.0}
+_LEAST = 1e-12
+
+
+@dataclass(frozen=True)
+class Anchoring:
+    """Moves the origin of chunks in physical units; `kinds` are those of the state's channels.
+
+    Rotation vectors are composed, R(step)·R(tick)·R(frame)ᵀ. A sample without features or states
+    counts from its tick.
+    """
+
+    anchors: Sequence[Anchor]
+    kinds: Sequence[Kind]
+
+    def from_frame(self, chunks: Chunks, seen: Observation) -> Chunks:
+        """Chunks that count from the newest frame, of those that count from the tick."""
+        return self._moved(chunks, seen, 1.0)
+
+    def from_tick(self, chunks: Chunks, seen: Observation) -> Chunks:
+        """The inverse of `from_frame`: what the robot executes."""
+        return self._moved(chunks, seen, -1.0)
+
+    def _moved(self, chunks: Chunks, seen: Observation, sign: float) -> Chunks:
+        if not self.anchors:
+            return chunks
+        known = seen.slot_valid.any(dim=1) & (seen.state_valid > 0)
+        now = seen.state[:, -1].float()
+        then = torch.where(known.unsqueeze(1), state_at_frame(seen, self.kinds), now)
+        first = list(chunks[..., 0, :].unbind(-1))
+        for anchor in self.anchors:
+            channels = list(anchor.state)
+            step = torch.stack([first[channel] for channel in anchor.action], dim=-1)
+            if anchor.composed:
+                turn = _turn(now[:, channels], then[:, channels])
+                turn = turn if sign > 0 else turn.transpose(-1, -2)
+                step = _vector(_matrix(step.deg2rad()) @ turn).rad2deg()
+            else:
+                kinds = [self.kinds[channel] for channel in channels]
+                step = step + sign * _difference(now[:, channels], then[:, channels], kinds)
+            for channel, moved in zip(anchor.action, step.unbind(-1), strict=True):
+                first[channel] = moved
+        return torch.cat([torch.stack(first, dim=-1).unsqueeze(-2), chunks[..., 1:, :]], dim=-2)
+
+
+def state_at_frame(seen: Observation, kinds: Sequence[Kind]) -> Float[Tensor, "batch channel"]:
+    """The state when the newest frame was taken, linear between readings; angles the short way."""
+    state, readings = seen.state.float(), seen.state.shape[1]
+    age_s, oldest = seen.feature_age.float().unsqueeze(1), readings - seen.state_valid.unsqueeze(1)
+    # Readings that are not real have age 0.
+    older = (seen.state_age > age_s).sum(dim=1, keepdim=True)
+    later = (oldest + older).clamp(max=readings - 1)
+    earlier = torch.minimum((later - 1).clamp(min=0).maximum(oldest), later)
+    age_before, age_after = (seen.state_age.gather(1, place) for place in (earlier, later))
+    share = ((age_before - age_s) / (age_before - age_after).clamp(min=_LEAST)).clamp(0.0, 1.0)
+    width = state.shape[-1]
+    before, after = (
+        state.gather(1, place.unsqueeze(-1).expand(-1, -1, width)).squeeze(1)
+        for place in (earlier, later)
+    )
+    return before + share * _difference(after, before, kinds)
+
+
+def _turn(
+    now: Float[Tensor, "batch 3"], then: Float[Tensor, "batch 3"]
+) -> Float[Tensor, "batch 3 3"]:
+    """The rotation from one pose's angles in degrees to another's, in the base frame."""
+    here, there = (rotation_matrix(angles.deg2rad()) for angles in (now, then))
+    return here @ there.transpose(-1, -2)
+
+
+def _difference(later: Tensor, earlier: Tensor, kinds: Sequence[Kind]) -> Tensor:
+    """`later` less `earlier`, (…, channel); angles the short way round."""
+    turn = later.new_tensor([_FULL_TURN.get(kind, torch.inf) for kind in kinds])
+    change = later - earlier
+    return torch.where(turn.isinf(), change, change - turn * (change / turn).round())
+
+
+def _matrix(vector: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
+    """The rotation matrix of a rotation vector in rad (Rodrigues)."""
+    angle = vector.square().sum(-1, keepdim=True).clamp(min=_LEAST).sqrt().unsqueeze(-1)
+    x, y, z = vector.unbind(-1)
+    zero = torch.zeros_like(x)
+    rows = [[zero, -z, y], [z, zero, -x], [-y, x, zero]]
+    cross = torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2)
+    identity = torch.eye(3, device=vector.device, dtype=vector.dtype)
+    straight, curved = angle.sin() / angle, (1 - angle.cos()) / angle.square()
+    return identity + straight * cross + curved * (cross @ cross)
+
+
+def _vector(matrix: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3"]:
+    """The rotation vector in rad of a rotation matrix by less than half a turn."""
+    skew = matrix - matrix.transpose(-1, -2)
+    axis = torch.stack([skew[..., 2, 1], skew[..., 0, 2], skew[..., 1, 0]], dim=-1) / 2
+    sine = axis.square().sum(-1, keepdim=True).clamp(min=_LEAST).sqrt()
+    cosine = (matrix.diagonal(dim1=-2, dim2=-1).sum(-1, keepdim=True) - 1) / 2
+    return axis * (torch.atan2(sine, cosine) / sine)

@@ -1,0 +1,149 @@
+"""Chunks that count from the newest frame."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from pipeline.base.config import TrainHeadParams
+from pipeline.base.errors import ConfigError
+from pipeline.base.observation import Observation
+from pipeline.policy.anchoring import Anchoring, state_at_frame
+from pipeline.policy.expert import Guide
+from pipeline.policy.policy import Policy
+from pipeline.policy.shape import Anchor, PolicyShape, channel_kinds, find_anchors
+from pipeline.robot.export import Head, trace
+
+POSE = {
+    "names": ["joint_1", "pose_x", "pose_y", "pose_z", "pose_a", "pose_b", "pose_r"],
+    "units": ["rad", "mm", "mm", "mm", "deg", "deg", "deg"],
+}
+KINDS = channel_kinds(**POSE)
+ROTVEC = {
+    "kind": "delta",
+    "names": ["dx", "dy", "dz", "rx", "ry", "rz", "gripper"],
+    "units": ["mm"] * 3 + ["deg"] * 3 + [""],
+}
+START = torch.tensor([3.1, 5.0, -4.0, 0.0, 20.0, 10.0, 179.0])
+SPEED = torch.tensor([2.0, 10.0, -3.0, 1.0, 30.0, 20.0, 40.0])
+"""A second: joint and rotation pass half a turn."""
+
+
+@pytest.fixture
+def moving(observe: Callable[..., Any]) -> Any:
+    """Four samples of an arm in steady motion; the frame of each is older than the one before."""
+    seen = observe(4, 13, 25)
+    state = START - seen.state_age[..., None] * SPEED
+    state[..., 0] = (state[..., 0] + np.pi) % (2 * np.pi) - np.pi
+    state[..., 6] = (state[..., 6] + 180) % 360 - 180
+    return replace(seen, state=state, feature_age=torch.tensor([0.0, 0.03, 0.31, 0.9]))
+
+
+def test_the_state_is_interpolated_on_its_clock(moving: Any) -> None:
+    change = state_at_frame(moving, KINDS) - moving.state[:, -1]
+    turn = torch.tensor([2 * np.pi, *[torch.inf] * 3, 360.0, 360.0, 360.0])
+    change = torch.where(turn.isinf(), change, (change + turn / 2) % turn - turn / 2)
+    torch.testing.assert_close(change, -moving.feature_age[:, None] * SPEED, atol=2e-4, rtol=0)
+
+
+def test_before_the_first_reading_it_is_that_reading(moving: Any) -> None:
+    few = replace(moving, state_valid=torch.full((4,), 5))
+    few.state_age[:, :-5] = 0
+    few.state[:, :-5] = 0
+    torch.testing.assert_close(state_at_frame(few, KINDS)[3], few.state[3, -5])
+    one = replace(few, state_valid=torch.ones(4, dtype=torch.int64))
+    torch.testing.assert_close(state_at_frame(one, KINDS), one.state[:, -1])
+
+
+def test_a_step_counts_from_the_frame_and_back(moving: Any) -> None:
+    anchoring = Anchoring(find_anchors(ROTVEC, POSE, ["dx", "dy", "rx", "ry", "rz"]), KINDS)
+    chunks = torch.randn(2, 4, 8, 7)
+    counted = anchoring.from_frame(chunks, moving)
+    assert counted[..., 1:, :].equal(chunks[..., 1:, :])
+    assert counted[..., [2, 6]].equal(chunks[..., [2, 6]])
+    moved = (moving.feature_age[:, None] * SPEED[1:3]).expand(2, 4, 2)
+    torch.testing.assert_close(counted[..., 0, :2], chunks[..., 0, :2] + moved, atol=1e-4, rtol=0)
+    now, then = (
+        Rotation.from_euler("XYZ", angles[:, 4:].double(), degrees=True)
+        for angles in (moving.state[:, -1], state_at_frame(moving, KINDS))
+    )
+    step = Rotation.from_rotvec(chunks[0, :, 0, 3:6].double(), degrees=True)
+    composed = torch.from_numpy((step * now * then.inv()).as_rotvec(degrees=True)).float()
+    torch.testing.assert_close(counted[0, :, 0, 3:6], composed, atol=1e-3, rtol=0)
+    torch.testing.assert_close(anchoring.from_tick(counted, moving), chunks, atol=1e-3, rtol=0)
+
+
+@pytest.mark.parametrize("missing", ["slot_valid", "state_valid"])
+def test_without_frames_or_states_it_counts_from_the_tick(moving: Any, missing: str) -> None:
+    moving = replace(moving, **{missing: torch.zeros_like(getattr(moving, missing))})
+    chunks = torch.randn(4, 8, 7)
+    anchoring = Anchoring(find_anchors(ROTVEC, POSE, ["dx"]), KINDS)
+    for count in (anchoring.from_frame, anchoring.from_tick):
+        torch.testing.assert_close(count(chunks, moving), chunks)
+
+
+def test_channels_that_the_state_tells() -> None:
+    joints = {"kind": "delta", "names": ["joint_1", "wrist"], "units": ["rad", "rad"]}
+    assert find_anchors(joints, POSE, ["joint_1"]) == (Anchor((0,), (0,)),)
+    euler = {**ROTVEC, "names": ["dx", "dy", "dz", "da", "db", "dr", "gripper"]}
+    assert find_anchors(euler, POSE, ["db", "dx"]) == (Anchor((4,), (5,)), Anchor((0,), (1,)))
+    for action, wanted in (
+        (euler, ["dx", "gripper"]),
+        (joints, ["wrist"]),
+        (ROTVEC, ["rx"]),  # a rotation vector is anchored whole
+        ({**euler, "kind": "velocity"}, ["dx"]),
+        ({**euler, "units": ["m"] * 7}, ["dx"]),
+    ):
+        with pytest.raises(ConfigError, match=rf"train_head\.anchor: .*found {wanted[-1]}"):
+            find_anchors(action, POSE, wanted)
+
+
+def test_it_needs_frames_and_states() -> None:
+    for off in ("features_enabled", "robot_state_enabled"):
+        with pytest.raises(ValueError, match="anchor counts from the newest frame"):
+            TrainHeadParams.model_validate({"anchor": ["dx"], off: False})
+
+
+@pytest.mark.parametrize("model_type", ["regression", "flow_matching"])
+def test_a_policy_learns_and_answers_from_the_frame(
+    model_type: str,
+    build_policy: Callable[..., Policy],
+    observe: Callable[..., Any],
+    shape: PolicyShape,
+) -> None:
+    plain = build_policy(model_type=model_type).eval()
+    anchored = build_policy(model_type=model_type).eval()
+    anchored.anchoring = count = Anchoring((Anchor((0,), (3,)),), shape.kinds)
+    seen = observe()
+    target = count.from_frame(seen.action, seen)
+    assert not target.equal(seen.action)
+
+    def drawn() -> torch.Generator:
+        return torch.Generator().manual_seed(3)
+
+    torch.testing.assert_close(
+        anchored.act(seen, drawn()), count.from_tick(plain.act(seen, drawn()), seen)
+    )
+    loss = anchored.loss(seen, seen.action, seen.action_valid, drawn())[0]
+    torch.testing.assert_close(loss, plain.loss(seen, target, seen.action_valid, drawn())[0])
+    if plain.stochastic:
+        weight = torch.ones(4, 8)
+        guided = anchored.act(seen, drawn(), Guide(seen.action, weight))
+        wanted = plain.act(seen, drawn(), Guide(target, weight))
+        torch.testing.assert_close(guided, count.from_tick(wanted, seen))
+
+
+def test_an_exported_head_counts_likewise(
+    build_policy: Callable[..., Policy], observe: Callable[..., Any], shape: PolicyShape
+) -> None:
+    policy = build_policy().eval()
+    policy.anchoring = Anchoring((Anchor((0, 1), (3, 4)),), shape.kinds)
+    head = Head(policy).requires_grad_(False)
+    fields = {name: getattr(observe(2), name) for name in Observation.__dataclass_fields__}
+    program = trace(head, fields).module()
+    other = {name: getattr(observe(3), name) for name in fields}
+    torch.testing.assert_close(program(**other), head(**other))
