@@ -146,7 +146,7 @@ def test_one_episode_crosses_180(demo_root: Path) -> None:
 
 
 def test_same_seed_same_bytes(demo_root: Path, tmp_path: Path) -> None:
-    """Of as many episodes as there are, and of another number of them."""
+    """An episode is the same whatever the number of episodes; only what counts them is not."""
     write_demo_recordings(tmp_path / "again", 1, SEED)
     again, before = contents(tmp_path / "again"), contents(demo_root)
     counting = [name for name in again if name == MARKER or "meta/" in name]
