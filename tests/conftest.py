@@ -26,10 +26,15 @@ import numpy as np
 import pytest
 import torch
 from beartype import beartype
+from hypothesis import HealthCheck, settings
 from jaxtyping import AbstractArray, install_import_hook
 
 ROOT = Path(__file__).resolve().parents[1]
 
+
+# By no clock: on a busy machine an example may wait for the processor for seconds.
+settings.register_profile("busy", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.load_profile("busy")
 
 SCHEDULED = os.sched_getscheduler(0), os.sched_getparam(0)
 

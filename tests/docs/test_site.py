@@ -12,7 +12,8 @@ DESKTOP, PHONE = (1280, 900), (390, 844)
 SIDEWAYS = """[...document.querySelectorAll('figure.drawing')]
     .filter(figure => figure.scrollWidth > figure.clientWidth).map(figure => figure.outerHTML)"""
 """The figures that a reader has to push sideways to see whole."""
-PAGES = ("index", "concepts", "store", "params", "data/errors", "reference/store")
+PAGES = ("index", "params", "data/errors")
+MORE = ("concepts", "store", "reference/store")
 
 
 class Links(HTMLParser):
@@ -98,7 +99,7 @@ def width(visitor: Reader) -> int:
     return visitor.page.evaluate("document.documentElement.scrollWidth")
 
 
-@pytest.mark.parametrize("name", PAGES)
+@pytest.mark.parametrize("name", [*PAGES, *(pytest.param(n, marks=pytest.mark.slow) for n in MORE)])
 def test_a_page_loads_alone_and_fits_every_screen(site, reader, name):
     visitor = reader(viewport={"width": DESKTOP[0], "height": DESKTOP[1]})
     open_page(visitor, site / f"{name}.html")

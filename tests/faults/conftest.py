@@ -5,10 +5,7 @@ Where a test needs a process and not an interpreter, `fork` makes one of the `fo
 
 import importlib
 import importlib.util
-import os
 import shutil
-import subprocess
-import sys
 from collections.abc import Callable
 from multiprocessing.connection import Connection
 from multiprocessing.context import ForkServerContext
@@ -124,26 +121,6 @@ def head_params(tiny_head: TinyHead, tmp_path: Path) -> Callable[..., Path]:
         return write_params(document, folder)
 
     return write
-
-
-Started = subprocess.Popen[str]
-
-
-@pytest.fixture
-def start() -> Callable[..., Started]:
-    """`start("stages.extract", params, *options)`, or Python code in place of a stage's name."""
-
-    def start(what: str, params: Path, *options: str) -> Started:
-        module = ["-m", what] if what.startswith("stages.") else ["-c", what]
-        return subprocess.Popen(
-            [sys.executable, *module, "--params", str(params), *options],
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-            env=os.environ | {"PYTHONPATH": str(ROOT)},
-        )
-
-    return start
 
 
 Fork = Callable[..., tuple[BaseProcess, Connection]]

@@ -30,14 +30,22 @@ HARMS: dict[str, Callable[[Path], None]] = {
     "gone": Path.unlink,
 }
 CHUNKS = ["vl/features/c/0/0/0", "sensor/values/c/0/0", "tick/action/c/0/0"]
+each_harm = pytest.mark.parametrize(
+    ("harm", "chunk"),
+    [
+        pytest.param(harm, chunk, marks=[pytest.mark.slow] * (bool(place) and place != turn))
+        for turn, harm in enumerate(HARMS)
+        for place, chunk in enumerate(CHUNKS)
+    ],
+)
+"""Every harm to the features, and one to each other array."""
 
 
 def nothing(line: str) -> None:
     """Says nothing."""
 
 
-@pytest.mark.parametrize("chunk", CHUNKS)
-@pytest.mark.parametrize("harm", HARMS)
+@each_harm
 def test_it_is_named_by_everything_that_reads(store: Path, params: Path, here, harm, chunk) -> None:
     HARMS[harm](store / chunk)
     if harm != "flipped":
@@ -71,8 +79,7 @@ def right(extracted, write_episode, tmp_path_factory) -> FeatureStore:
     return FeatureStore.open(path)
 
 
-@pytest.mark.parametrize("chunk", CHUNKS)
-@pytest.mark.parametrize("harm", HARMS)
+@each_harm
 def test_an_extraction_beside_it_takes_no_wrong_row(
     document, store: Path, recordings: Path, write_episode, right: FeatureStore, harm, chunk
 ) -> None:

@@ -83,8 +83,13 @@ def content(place: Path) -> dict[Path, bytes]:
 @pytest.mark.parametrize(
     ("writer", "foreign"),
     [
-        *((writer, foreign) for writer in WRITERS for foreign in ("folder", "file", "zarr group")),
-        *((writer, "dvclive") for writer in ("head logs", "tuned logs")),
+        *(
+            pytest.param(writer, kind, marks=[pytest.mark.slow] * (turn % 3 != at))
+            for turn, writer in enumerate(WRITERS)
+            for at, kind in enumerate(("folder", "file", "zarr group"))
+        ),
+        ("head logs", "dvclive"),
+        ("tuned logs", "dvclive"),
     ],
 )
 def test_is_left_as_it_is(

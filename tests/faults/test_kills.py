@@ -1,5 +1,6 @@
 """SIGKILL at random instants, several times over: the end is that of an undisturbed run."""
 
+import itertools
 import random
 import signal
 import time
@@ -16,31 +17,32 @@ from pipeline.train.loop import Trainer
 from stages import store, train_head
 from stages.command import run
 
+AHEAD = 4
+"""Steps or writes that a process goes on for and then waits, however late its kill comes."""
 
-def train(params: Path, told: Connection) -> None:
+
+def paced(owner: type, name: str, last: int, told: Connection) -> None:
+    """Have a process tell of each call of a method, and wait for its end after the last one."""
+    work, counts = getattr(owner, name), itertools.count(1)
+
+    def slow(*arguments: Any) -> Any:
+        done = work(*arguments)
+        told.send(name)
+        time.sleep(0.005 if next(counts) < last else 600)
+        return done
+
+    setattr(owner, name, slow)
+
+
+def train(params: Path, last: int, told: Connection) -> None:
     """Train, and tell of each step."""
-    step = Trainer._train_step
-
-    def slow(self: Trainer, *rest: Any) -> bool:
-        stopped = step(self, *rest)
-        told.send(self.step)
-        time.sleep(0.01)
-        return stopped
-
-    Trainer._train_step = slow
+    paced(Trainer, "_train_step", last, told)
     run("", train_head.main, ["--params", str(params)])
 
 
-def merge(params: Path, words: list[str], told: Connection) -> None:
+def merge(params: Path, words: list[str], last: int, told: Connection) -> None:
     """Merge stores, and tell of each write."""
-    write = ChunkFiles.write
-
-    def slow(self: ChunkFiles, *rest: Any) -> None:
-        told.send("write")
-        time.sleep(0.005)
-        write(self, *rest)
-
-    ChunkFiles.write = slow
+    paced(ChunkFiles, "write", last, told)
     run("", store.main, ["--params", str(params), *words], store.SHORTHANDS)
 
 
@@ -49,11 +51,10 @@ def kill_after(fork) -> Callable[..., None]:
     """`kill_after(count, wait_s, work, ...)`: SIGKILL it so long after it told so often."""
 
     def kill(count: int, wait_s: float, work: Callable[..., None], *arguments: Any) -> None:
-        process, heard = fork(work, *arguments)
+        process, heard = fork(work, *arguments, count + AHEAD)
         for _ in range(count):
             heard.recv()
         time.sleep(wait_s)
-        assert process.is_alive(), "the kill came too late to test anything"
         process.kill()
         process.join()
         assert process.exitcode == -signal.SIGKILL
@@ -70,10 +71,8 @@ def test_a_training_killed_again_and_again(
     """Between checkpoints, while one is written, while it is judged: wherever the kill falls."""
     chance = random.Random(seed)
     path = tiny_store(tmp_path)
-    # So long that no kill can come too late.
-    killed, whole = (
-        head_params(path, name, train_head={"max_steps": 120}) for name in ("killed", "whole")
-    )
+    steps = {"max_steps": (12 + AHEAD) * kills + 4}
+    killed, whole = (head_params(path, name, train_head=steps) for name in ("killed", "whole"))
     for _ in range(kills):
         kill_after(chance.randint(1, 12), chance.uniform(0.0, 0.02), train, killed)
     for params in (killed, whole):
@@ -95,7 +94,7 @@ def test_a_merge_killed_again_and_again(
     inputs = [str(tiny_store(tmp_path, name=name, seed=seed)) for seed, name in enumerate("ab")]
     params = head_params(Path("unused.zarr"))
     words = ["merge", *inputs, "--into"]
-    _, heard = fork(merge, params, [*words, str(tmp_path / "counted.zarr")])
+    _, heard = fork(merge, params, [*words, str(tmp_path / "counted.zarr")], 10**6)
     writes = 0
     with suppress(EOFError):
         while heard.recv():

@@ -73,7 +73,7 @@ def check_prefix(recording: Recording) -> int:
     return rows
 
 
-@pytest.mark.parametrize("ticks", [40, 77, 150])
+@pytest.mark.parametrize("ticks", [77])
 def test_a_killed_run(fork, tmp_path: Path, ticks: int) -> None:
     process, heard = fork(run_on, tmp_path)
     for _ in range(ticks):

@@ -1,45 +1,42 @@
 """Two extractions on one store: the second is told of the first; a dead one means nothing."""
 
-import signal
+import time
+from multiprocessing.connection import Connection
 from pathlib import Path
+from typing import Any
 
 from pipeline.store import FeatureStore
 from pipeline.store.inventory import list_stores
-
-SLOWED = """
-import sys, time
-from pipeline.store import writer
+from pipeline.store.writer import StoreBuild
 from stages import extract
 from stages.command import run
 
-seal = writer.StoreBuild.seal
-def slow(self, **how):
-    print("sealing", flush=True)
-    time.sleep(600)
-writer.StoreBuild.seal = slow
-sys.exit(run("", extract.main, sys.argv[1:]))
-"""
+
+def extract_until_sealing(params: Path, told: Connection) -> None:
+    """Extract, tell that all is there but the seal, and wait for the end."""
+
+    def wait(self: StoreBuild, **how: Any) -> None:
+        told.send("sealing")
+        time.sleep(600)
+
+    StoreBuild.seal = wait
+    run("", extract.main, ["--params", str(params)])
 
 
 def test_the_second_is_refused_and_a_killed_first_is_none(
-    params: Path, store: Path, recordings: Path, write_episode, start, here
+    params: Path, store: Path, recordings: Path, write_episode, fork, here
 ) -> None:
     write_episode(recordings / "Touch_dot" / "episode_4", 4)
-    first = start(SLOWED, params)
+    first, heard = fork(extract_until_sealing, params)
     try:
-        assert first.stdout is not None
-        while line := first.stdout.readline():
-            if line == "sealing\n":
-                break
-        assert first.poll() is None, "the first must still be at work"
+        heard.recv()
         code, _, complained = here("stages.extract", params)
         assert code == 2
         assert f"being built by process {first.pid} on" in complained
-        assert "run the same command again" in complained
         assert {entry.base for entry in list_stores(store.parent) if entry.holder} == {store}
     finally:
-        first.send_signal(signal.SIGKILL)
-        first.communicate()
+        first.kill()
+        first.join()
     assert store.with_name("made.zarr.lock").read_text().startswith(f"process {first.pid}")
     assert not [entry for entry in list_stores(store.parent) if entry.holder]
     code, said, complained = here("stages.extract", params)

@@ -102,7 +102,7 @@ def pictures(comparison: Comparison, predictions: Predictions, store: Any) -> di
 
 @pytest.mark.parametrize(
     ("episodes", "dimensions", "constant", "horizon"),
-    [(1, 5, 1, 3), (2, 2, 0, 3), (3, 14, 1, 20), (2, 3, 3, 3), (1, 1, 0, 1)],
+    [(3, 14, 1, 20), (2, 3, 3, 3), (1, 1, 0, 1)],
 )
 def test_every_picture_is_written(
     tmp_path: Path, episodes: int, dimensions: int, constant: int, horizon: int
@@ -119,7 +119,7 @@ def test_the_same_numbers_are_the_same_bytes(tmp_path: Path) -> None:
     written = []
     for name in ("one", "two"):
         (tmp_path / name).mkdir()
-        files = write(tmp_path / name, pictures(*evaluated(2)))
+        files = write(tmp_path / name, pictures(*evaluated(1)))
         written.append([file.read_bytes() for file in files])
     assert written[0] == written[1]
 

@@ -4,14 +4,17 @@ import json
 import os
 import subprocess
 import sys
+from collections.abc import Callable
 from hashlib import sha256
+from importlib.util import find_spec
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
 import torch
+from torch.export import ExportedProgram
 
 from pipeline.base.config import ExportParams, TrainHeadParams, load_params
 from pipeline.base.errors import ConfigError, NumericsError
@@ -20,7 +23,7 @@ from pipeline.policy.normalization import ChannelStatistics, Normalization
 from pipeline.policy.observation import PolicyShape
 from pipeline.policy.policy import Policy
 from pipeline.robot import export
-from pipeline.robot.export import Head, export_head, onnx_runner, torch_runner
+from pipeline.robot.export import Head, export_head, onnx_runner, torch_runner, trace
 from pipeline.robot.export_inputs import count_draws, random_inputs
 
 GROUPS = ("translation", "translation", "rotation")
@@ -43,28 +46,45 @@ SMALL: dict[str, Any] = {
     "sensor_window": 6,
     "state_window": 5,
 }
-EXPERTS = ("regression", "diffusion", "flow_matching")
-KINDS = [
+REGRESSION, DIFFUSION, FLOW = (
     {"model_type": expert, "fusion_strategy": fusion}
-    for expert in EXPERTS
-    for fusion in ("concat", "cross_attention", "gated", "none")
+    for expert, fusion in (
+        ("regression", "concat"),
+        ("diffusion", "cross_attention"),
+        ("flow_matching", "gated"),
+    )
+)
+UNUSUAL: list[dict[str, Any]] = [
+    {
+        "fusion_strategy": "none",
+        "regression": {"refinements": 2},
+        "sensor_encoder": SMALL["sensor_encoder"] | {"kind": "force_aware"},
+        "sensor_window_s": None,
+        "state_window_s": None,
+    },
+    {
+        "sensor_enabled": False,
+        "robot_state_enabled": False,
+        "model_type": "diffusion",
+        "diffusion": {"timesteps": 6, "sampling_steps": 3, "eta": 1.0},
+    },
+    {
+        "features_enabled": False,
+        "model_type": "flow_matching",
+        "flow_matching": {"sampling_steps": 2, "solver": "rk4"},
+    },
 ]
-OTHERS = [
-    {"regression": {"refinements": 2}},
-    {"sensor_encoder": SMALL["sensor_encoder"] | {"kind": "force_aware"}},
-    {"sensor_window_s": None, "state_window_s": None},
-    {"features_enabled": False},
+RARE = [
+    *UNUSUAL,
     {"sensor_enabled": False, "fusion_strategy": "cross_attention"},
     {"robot_state_enabled": False, "fusion_strategy": "gated"},
-    {"sensor_enabled": False, "robot_state_enabled": False},
     {"model_type": "diffusion", "diffusion": {"timesteps": 6, "sampler": "ddpm"}},
-    {"model_type": "diffusion", "diffusion": {"timesteps": 6, "sampling_steps": 3, "eta": 1.0}},
-    {"model_type": "flow_matching", "flow_matching": {"sampling_steps": 2, "solver": "rk4"}},
+    *(
+        {"model_type": expert, "fusion_strategy": fusion}
+        for expert in ("regression", "diffusion", "flow_matching")
+        for fusion in ("concat", "cross_attention", "gated", "none")
+    ),
 ]
-
-
-def named(kind: dict[str, Any]) -> str:
-    return "-".join(str(value) for value in kind.values())
 
 
 def checkpoint_of(**changed: Any) -> PolicyCheckpoint:
@@ -99,9 +119,49 @@ def exported(
     return export_head(checkpoint, "models/head", params, lambda said: None)
 
 
-def onnx() -> None:
-    for package in ("onnx", "onnxscript", "onnxruntime"):
-        pytest.importorskip(package, reason=f"{package} is missing: pip install -e '.[export]'")
+HAS_ONNX = all(map(find_spec, ("onnx", "onnxscript", "onnxruntime")))
+needs_onnx = pytest.mark.skipif(not HAS_ONNX, reason="no ONNX: pip install -e '.[export]'")
+
+
+class Exported(NamedTuple):
+    """A checkpoint, the folder of its exported head, and the receipt."""
+
+    checkpoint: PolicyCheckpoint
+    folder: Path
+    receipt: dict[str, Any]
+
+
+Export = Callable[[dict[str, Any]], Exported]
+
+
+@pytest.fixture(scope="module")
+def export_of(tmp_path_factory: pytest.TempPathFactory) -> Export:
+    """`export_of(kind)`: its export in every format that can be written here, once a kind."""
+    done: dict[str, Exported] = {}
+
+    def export_once(kind: dict[str, Any]) -> Exported:
+        if str(kind) not in done:
+            folder, checkpoint = tmp_path_factory.mktemp("export") / "head", checkpoint_of(**kind)
+            receipt = exported(folder, checkpoint, *["onnx"] * HAS_ONNX, "torch")
+            done[str(kind)] = Exported(checkpoint, folder, receipt)
+        return done[str(kind)]
+
+    return export_once
+
+
+@pytest.fixture
+def traced_once(monkeypatch: pytest.MonkeyPatch, traced: ExportedProgram) -> None:
+    """Tracing, which takes seconds, gives what was traced before."""
+    monkeypatch.setattr(export, "trace", lambda head, given: traced)
+
+
+@pytest.fixture(scope="module")
+def traced() -> ExportedProgram:
+    """The graph of `checkpoint_of()`."""
+    checkpoint = checkpoint_of()
+    policy = checkpoint.policy()
+    head = Head(policy).eval().requires_grad_(False)
+    return trace(head, random_inputs(checkpoint, policy, 2))
 
 
 def assert_same(run: export.Runner, checkpoint: PolicyCheckpoint, atol: float) -> None:
@@ -115,24 +175,31 @@ def assert_same(run: export.Runner, checkpoint: PolicyCheckpoint, atol: float) -
         torch.testing.assert_close(found, expected, rtol=0, atol=atol)
 
 
-@pytest.mark.parametrize("kind", [*KINDS[::5], *OTHERS[::2]], ids=named)
+def assert_torch_is_the_policy(done: Exported) -> None:
+    assert done.receipt["files"]["head.pt2"]["deviation"]["random"]["std"] < 1e-5
+    assert_same(torch_runner(done.folder / "head.pt2"), done.checkpoint, 1e-5)
+
+
+@pytest.mark.parametrize("kind", UNUSUAL, ids=str)
 def test_torch_export_is_the_policy(kind: dict[str, Any], tmp_path: Path) -> None:
     checkpoint = checkpoint_of(**kind)
     receipt = exported(tmp_path / "head", checkpoint, "torch")
-    assert receipt["files"]["head.pt2"]["deviation"]["random"]["std"] < 1e-5
-    assert_same(torch_runner(tmp_path / "head/head.pt2"), checkpoint, 1e-5)
+    assert_torch_is_the_policy(Exported(checkpoint, tmp_path / "head", receipt))
 
 
 @pytest.mark.extra
-@pytest.mark.parametrize("kind", [*KINDS, *OTHERS[1::3]], ids=named)
-def test_both_formats_are_the_policy(kind: dict[str, Any], tmp_path: Path) -> None:
-    onnx()
-    checkpoint = checkpoint_of(**kind)
-    receipt = exported(tmp_path / "head", checkpoint, "onnx", "torch")
-    files = receipt["files"]
-    assert files["head.pt2"]["deviation"]["random"]["std"] < 1e-5
-    assert files["head.onnx"]["deviation"]["random"]["std"] < 2e-5
-    assert_same(onnx_runner(tmp_path / "head/head.onnx"), checkpoint, 2e-5)
+@pytest.mark.parametrize(
+    "kind",
+    [REGRESSION, DIFFUSION, FLOW, *(pytest.param(kind, marks=pytest.mark.slow) for kind in RARE)],
+    ids=str,
+)
+def test_every_format_is_the_policy(kind: dict[str, Any], export_of: Export) -> None:
+    done = export_of(kind)
+    assert_torch_is_the_policy(done)
+    if not HAS_ONNX:
+        pytest.skip("no ONNX: pip install -e '.[export]'")
+    assert done.receipt["files"]["head.onnx"]["deviation"]["random"]["std"] < 2e-5
+    assert_same(onnx_runner(done.folder / "head.onnx"), done.checkpoint, 2e-5)
 
 
 @pytest.mark.parametrize(
@@ -169,9 +236,8 @@ def test_random_inputs_miss_each_stream_and_are_old() -> None:
     assert given["feature_age"].max() > 5
 
 
-def test_the_receipt_says_what_goes_in_and_comes_out(tmp_path: Path) -> None:
-    folder = tmp_path / "head"
-    receipt = exported(folder, checkpoint_of(model_type="flow_matching"), "torch")
+def test_the_receipt_says_what_goes_in_and_comes_out(export_of: Export) -> None:
+    _, folder, receipt = export_of(FLOW)
     assert json.loads((folder / "receipt.json").read_text()) == receipt
     inputs = {one["name"]: one for one in receipt["inputs"]}
     assert list(inputs) == [
@@ -201,9 +267,9 @@ torch.save(torch.export.load("head/head.pt2").module()(**given), "actions.pt")
 """
 
 
-def test_a_process_without_this_project_runs_it(tmp_path: Path) -> None:
-    checkpoint = checkpoint_of(model_type="diffusion")
-    exported(tmp_path / "head", checkpoint, "torch")
+def test_a_process_without_this_project_runs_it(export_of: Export, tmp_path: Path) -> None:
+    checkpoint, folder, _ = export_of(DIFFUSION)
+    (tmp_path / "head").symlink_to(folder)
     policy = checkpoint.policy()
     given = random_inputs(checkpoint, policy, 2)
     torch.save(given, tmp_path / "given.pt")
@@ -226,10 +292,12 @@ print(session.get_modelmeta().custom_metadata_map["contract.json"])
 
 
 @pytest.mark.extra
-def test_onnx_runtime_needs_no_torch_and_the_file_says_what_it_is(tmp_path: Path) -> None:
-    onnx()
-    checkpoint = checkpoint_of(model_type="flow_matching")
-    receipt = exported(tmp_path / "head", checkpoint, "onnx")
+@needs_onnx
+def test_onnx_runtime_needs_no_torch_and_the_file_says_what_it_is(
+    export_of: Export, tmp_path: Path
+) -> None:
+    checkpoint, folder, receipt = export_of(FLOW)
+    (tmp_path / "head").symlink_to(folder)
     policy = checkpoint.policy()
     given = random_inputs(checkpoint, policy, 2)
     np.savez(tmp_path / "given.npz", **{name: value.numpy() for name, value in given.items()})
@@ -242,6 +310,7 @@ def test_onnx_runtime_needs_no_torch_and_the_file_says_what_it_is(tmp_path: Path
     assert str(Path(__file__).parents[2]).encode() not in (tmp_path / "head/head.onnx").read_bytes()
 
 
+@pytest.mark.usefixtures("traced_once")
 def test_a_file_that_is_off_is_refused_and_the_old_one_stays(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -267,6 +336,7 @@ def test_a_file_that_is_off_is_refused_and_the_old_one_stays(
         exported(folder, checkpoint, "torch")
 
 
+@pytest.mark.usefixtures("traced_once")
 def test_a_missing_package_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "onnxscript", None)
     with pytest.raises(ConfigError, match=r"onnxscript .*pip install .*\[export\]"):
@@ -281,6 +351,7 @@ def test_somebody_elses_folder_is_left_alone(tmp_path: Path) -> None:
     assert (tmp_path / "notes.txt").read_text() == "mine"
 
 
+@pytest.mark.usefixtures("traced_once")
 def test_golden_rows_are_judged_too(tmp_path: Path) -> None:
     checkpoint, rng = checkpoint_of(), np.random.default_rng(0)
     rows = [

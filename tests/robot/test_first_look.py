@@ -55,7 +55,7 @@ def swapped(frames: Frames, first: str, second: str) -> Frames:
 
 
 class TestFrames:
-    @pytest.mark.parametrize("seed", range(50, 60))
+    @pytest.mark.parametrize("seed", range(50, 54))
     def test_right_ones_pass(self, look, seed):
         look.check(seen(seed))
 
@@ -64,7 +64,7 @@ class TestFrames:
         lit = {v: (f * np.array(gains)).clip(0, 255).astype("u1") for v, f in seen(51).items()}
         look.check(lit)
 
-    @pytest.mark.parametrize("seed", range(60, 65))
+    @pytest.mark.parametrize("seed", range(60, 62))
     def test_two_views_exchanged(self, look, seed):
         with pytest.raises(ObservationError, match=r"images/View1 shows View5, images/View5 shows"):
             look.check(swapped(seen(seed), "View1", "View5"))
@@ -148,7 +148,7 @@ class TestState:
         near = REST + np.random.default_rng(seed).normal(size=5) * [1.0, 1.0, 1.0, 4.0, 4.0]
         return np.tile(near, (7, 1)).astype(np.float32)
 
-    @pytest.mark.parametrize("seed", range(5))
+    @pytest.mark.parametrize("seed", range(2))
     def test_right_ones_pass(self, look, seed):
         look.check({}, self.around(seed))
 

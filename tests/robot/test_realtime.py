@@ -267,14 +267,106 @@ def test_a_first_chunk_that_never_comes_stops_the_robot() -> None:
     assert not arm.acts
 
 
-def test_features_that_stay_old_stop_the_robot() -> None:
-    brain = Brain(lambda n, answer: answer.update(feature_age_s=0.01 * n))
-    stopped(Arm(), StopKind.OLD_FEATURES, "newest features", brain, old_features_s=0.2)
+def fail_at(at: int, error: BaseException) -> Callable[..., None]:
+    """What raises this at the call of that number."""
+
+    def fail(number: int, *_: Any) -> None:
+        if number == at:
+            raise error
+
+    return fail
 
 
-def test_features_of_no_age_stop_the_robot() -> None:
-    brain = Brain(lambda n, answer: answer.update(feature_age_s=np.nan))
-    stopped(Arm(), StopKind.OLD_FEATURES, "nan s old", brain)
+def moved(seconds: float, *names: str) -> Callable[[Observed], None]:
+    """Times that lie so much further."""
+    return lambda observed: observed.update({name: observed[name] + seconds for name in names})
+
+
+def frame_of_age(age_s: float) -> Arm:
+    old = lambda frames: frames.update(View1=(time.monotonic() + AHEAD_S - age_s, np.zeros(1)))  # noqa: E731
+    return Arm(sees=after(8, old))
+
+
+ALL_TIMES = ("time", "state_time", "sensor_time")
+NAN, INF = np.full((2, 2), np.nan), np.array([[np.inf]])
+STOPS: dict[str, Callable[[], RunReport]] = {
+    "features that stay old": lambda: stopped(
+        Arm(), StopKind.OLD_FEATURES, "newest features",
+        Brain(lambda n, answer: answer.update(feature_age_s=0.01 * n)), old_features_s=0.2,
+    ),
+    "features of no age": lambda: stopped(
+        Arm(), StopKind.OLD_FEATURES, "nan s old",
+        Brain(lambda n, answer: answer.update(feature_age_s=np.nan)),
+    ),
+    "a dead camera": lambda: stopped(
+        Arm(sees=after(8, dict[str, Any].clear)), StopKind.CAMERA, "View1: the robot gives no frame"
+    ),
+    "an old frame": lambda: stopped(frame_of_age(1.0), StopKind.CAMERA, "1.00 s old"),
+    "a frame of the future": lambda: stopped(frame_of_age(-1.0), StopKind.CAMERA, "-1.00 s old"),
+    "readings that keep their time": lambda: stopped(
+        Arm(after(9, put("sensor_time", np.array([2000.045])))), StopKind.STALLED, "sensor",
+        stalled_s=0.15,
+    ),
+    "a state that is no number": lambda: stopped(
+        Arm(after(9, put("state", NAN))), StopKind.NOT_A_NUMBER, "state"
+    ),
+    "a sensor that is infinite": lambda: stopped(
+        Arm(after(9, put("sensor", INF))), StopKind.NOT_A_NUMBER, "sensor"
+    ),
+    "a chunk of another shape": lambda: stopped(
+        Arm(), StopKind.POLICY, "(40, 2), found (40, 3)",
+        Brain(lambda n, answer: answer.update(actions=np.zeros((HORIZON, 3)))),
+    ),
+    "too much force": lambda: stopped(
+        Arm(after(9, put("sensor", np.array([[-3.0]], np.float32)))), StopKind.FORCE,
+        "force measured at -3", limits=limits(force={"most": {"force": 2.5}}),
+    ),
+    "leaving the workspace": lambda: stopped(
+        Arm(), StopKind.WORKSPACE, "x measured at 13",
+        limits=limits(workspace={"box": {"x": [-1, 12]}}),
+    ),
+    "a state of the future": lambda: stopped(
+        Arm(after(9, moved(1, "state_time"))), StopKind.CLOCK, "of the future, by 0.900 s"
+    ),
+    "a sensor of the future": lambda: stopped(
+        Arm(after(9, moved(1, "sensor_time"))), StopKind.CLOCK, "of the future, by 0.900 s"
+    ),
+    "readings that go back in time": lambda: stopped(
+        Arm(after(9, lambda seen: seen.update(state_time=seen["state_time"][::-1]))),
+        StopKind.CLOCK, "older than the one before",
+    ),
+    "a clock that leaps": lambda: stopped(
+        Arm(after(15, moved(1, *ALL_TIMES))), StopKind.CLOCK, "clock is +1.000 s from"
+    ),
+    "a clock that is set back": lambda: stopped(
+        Arm(after(15, moved(-1, *ALL_TIMES))), StopKind.CLOCK, "clock is -1.000 s from"
+    ),
+    "slow ticks": lambda: stopped(
+        Arm(moves=lambda tick: time.sleep(0.05) if tick >= 5 else None), StopKind.MISSED, "'act'"
+    ),
+    "a policy that fails": lambda: stopped(
+        Arm(), StopKind.POLICY, "ValueError: no such head",
+        Brain(fail_at(3, ValueError("no such head"))),
+    ),
+    "a lost connection": lambda: stopped(
+        Arm(), StopKind.CONNECTION, "gone", Brain(fail_at(3, ConnectionResetError("gone")))
+    ),
+    "a recorder that fails": lambda: stopped(
+        Arm(), StopKind.RECORDER, "disk full", recorder=Notes(OSError("disk full"))
+    ),
+    "Ctrl-C": lambda: stopped(
+        Arm(moves=fail_at(7, KeyboardInterrupt())), StopKind.BY_HAND, "stopped by hand (SIGINT)"
+    ),
+    "no more to do": lambda: stopped(
+        Arm(after(9, put("ended", "inserted"))), StopKind.ENDED, "inserted"
+    ),
+}  # fmt: skip
+"""What ends a run by itself, before its time is up."""
+
+
+@pytest.mark.parametrize("stop", STOPS.values(), ids=STOPS)
+def test_whatever_goes_wrong_stops_the_robot(stop: Callable[[], RunReport]) -> None:
+    stop()
 
 
 def test_a_busy_server_is_asked_again_with_its_frames_and_the_readings_that_follow() -> None:
@@ -299,20 +391,6 @@ def test_a_server_that_stays_busy_stops_the_robot() -> None:
     stopped(Arm(), StopKind.NO_CHUNK, "first chunk", Brain(busy), first_answer_s=0.1)
     since = 5
     stopped(Arm(), StopKind.NO_CHUNK, "used up", Brain(busy))
-
-
-def test_a_dead_camera_stops_the_robot() -> None:
-    arm = Arm(sees=after(8, dict[str, Any].clear))
-    stopped(arm, StopKind.CAMERA, "View1: the robot gives no frame")
-
-
-@pytest.mark.parametrize(("age_s", "said"), [(1.0, "1.00 s old"), (-1.0, "-1.00 s old")])
-def test_a_frame_that_is_old_or_of_the_future_stops_the_robot(age_s: float, said: str) -> None:
-    def old(frames: dict[str, Any]) -> None:
-        frames["View1"] = (arm.now() - age_s, frames["View1"][1])
-
-    arm = Arm(sees=after(8, old))
-    stopped(arm, StopKind.CAMERA, said)
 
 
 @pytest.mark.parametrize("stream", ["state", "sensor"])
@@ -352,23 +430,6 @@ def test_a_stream_that_limits_are_of_is_watched_whatever_the_policy_looks_at(
     assert report.dropped_readings == 0 and all("sensor" not in asked for asked in brain.asked)
 
 
-def test_readings_that_keep_their_time_have_stalled() -> None:
-    def stuck(observed: Observed) -> None:
-        observed["sensor_time"] = kept.setdefault("time", observed["sensor_time"])
-
-    kept: dict[str, Any] = {}
-    stopped(Arm(after(9, stuck)), StopKind.STALLED, "sensor", stalled_s=0.15)
-
-
-@pytest.mark.parametrize("stream", ["state", "sensor"])
-@pytest.mark.parametrize("bad", [np.nan, np.inf])
-def test_a_reading_that_is_no_number_stops_the_robot(stream: str, bad: float) -> None:
-    def spoil(observed: Observed) -> None:
-        observed[stream][-1, -1] = bad
-
-    stopped(Arm(after(9, spoil)), StopKind.NOT_A_NUMBER, stream)
-
-
 def test_an_action_that_is_no_number_stops_the_robot() -> None:
     def spoil(n: int, answer: Observed) -> None:
         answer["actions"][-1, 1] = np.nan if n == 5 else 0.1
@@ -376,11 +437,6 @@ def test_an_action_that_is_no_number_stops_the_robot() -> None:
     arm = Arm()
     stopped(arm, StopKind.NOT_A_NUMBER, "the policy's action", Brain(spoil))
     assert np.isfinite(arm.acts).all()
-
-
-def test_a_chunk_of_another_shape_stops_the_robot() -> None:
-    brain = Brain(lambda n, answer: answer.update(actions=np.zeros((HORIZON, 3))))
-    stopped(Arm(), StopKind.POLICY, "(40, 2), found (40, 3)", brain)
 
 
 def test_a_jump_beyond_limits_stops_the_robot_before_it_is_sent() -> None:
@@ -391,41 +447,6 @@ def test_a_jump_beyond_limits_stops_the_robot_before_it_is_sent() -> None:
     step = limits(step={"most": {"translation": 2.0}})
     stopped(arm, StopKind.LIMIT, "step of translation", Brain(jump), limits=step)
     assert max(map(max, arm.acts)) < 2
-
-
-def test_too_much_force_stops_the_robot() -> None:
-    press = after(9, put("sensor", np.array([[-3.0]], np.float32)))
-    stopped(Arm(press), StopKind.FORCE, "force measured at -3",
-            limits=limits(force={"most": {"force": 2.5}}))  # fmt: skip
-
-
-def test_leaving_the_workspace_stops_the_robot() -> None:
-    outside = limits(workspace={"box": {"x": [-1, 12]}})
-    stopped(Arm(), StopKind.WORKSPACE, "x measured at 13", limits=outside)
-
-
-@pytest.mark.parametrize("stream", ["state", "sensor"])
-def test_a_reading_of_the_future_stops_the_robot(stream: str) -> None:
-    def ahead(observed: Observed) -> None:
-        observed[f"{stream}_time"] = observed[f"{stream}_time"] + 1
-
-    stopped(Arm(after(9, ahead)), StopKind.CLOCK, "of the future, by 0.900 s")
-
-
-def test_readings_that_go_back_in_time_stop_the_robot() -> None:
-    def back(observed: Observed) -> None:
-        observed["state_time"] = observed["state_time"][::-1]
-
-    stopped(Arm(after(9, back)), StopKind.CLOCK, "older than the one before")
-
-
-@pytest.mark.parametrize("jump_s", [1.0, -1.0])
-def test_a_clock_that_jumps_stops_the_robot(jump_s: float) -> None:
-    def jump(observed: Observed) -> None:
-        for name in ("time", "state_time", "sensor_time"):
-            observed[name] = observed[name] + jump_s
-
-    stopped(Arm(after(15, jump)), StopKind.CLOCK, f"clock is {jump_s:+.3f} s from")
 
 
 def test_a_declared_offset_that_is_wrong_stops_the_robot() -> None:
@@ -445,27 +466,6 @@ def test_one_slow_tick_is_counted_and_told_with_the_part_that_took_the_time() ->
     np.testing.assert_array_equal(report.actions[:, 0], [*range(1, 12), *range(22, 60)])
 
 
-def test_too_many_slow_ticks_stop_the_robot() -> None:
-    arm = Arm(moves=lambda tick: time.sleep(0.05) if tick >= 5 else None)
-    stopped(arm, StopKind.MISSED, "'act'")
-
-
-def test_a_policy_that_fails_stops_the_robot() -> None:
-    def fail(n: int, answer: Observed) -> None:
-        if n == 3:
-            raise ValueError("no such head")
-
-    stopped(Arm(), StopKind.POLICY, "ValueError: no such head", Brain(fail))
-
-
-def test_a_lost_connection_stops_the_robot() -> None:
-    def fail(n: int, answer: Observed) -> None:
-        if n == 3:
-            raise ConnectionResetError("gone")
-
-    stopped(Arm(), StopKind.CONNECTION, "gone", Brain(fail))
-
-
 @pytest.mark.parametrize("where", ["observe", "act", "frames"])
 def test_an_exception_in_the_robots_code_stops_it_and_is_told(where: str) -> None:
     def fail(tick: int, *_: Any) -> None:
@@ -477,22 +477,6 @@ def test_an_exception_in_the_robots_code_stops_it_and_is_told(where: str) -> Non
         arm, StopKind.ROBOT, f"the robot's code failed ({where}): RuntimeError: bus error"
     )
     assert 'raise RuntimeError("bus error")' in report.traceback
-
-
-def test_a_recorder_that_fails_stops_the_robot() -> None:
-    class Full(Notes):
-        def tick(self, observed: Mapping[str, Any], action: Any) -> None:
-            raise OSError("disk full")
-
-    stopped(Arm(), StopKind.RECORDER, "disk full", recorder=Full())
-
-
-def test_ctrl_c_stops_the_robot() -> None:
-    def interrupt(tick: int) -> None:
-        if tick == 7:
-            raise KeyboardInterrupt
-
-    stopped(Arm(moves=interrupt), StopKind.BY_HAND, "stopped by hand (SIGINT)")
 
 
 ENDINGS = [
@@ -590,19 +574,16 @@ def test_the_robot_is_stopped_whatever_ends_the_process() -> None:
     assert len(arm.stops) == 1
 
 
-def test_a_robot_that_has_no_more_to_do_ends_the_run() -> None:
-    arm = Arm(after(9, put("ended", "inserted")))
-    stopped(arm, StopKind.ENDED, "inserted")
-
-
 class Notes:
-    """A recorder that counts."""
+    """A recorder that counts, and fails where it is to: at a tick, or as it finishes."""
 
-    def __init__(self) -> None:
+    def __init__(self, fails: OSError | None = None, cannot: Exception | None = None) -> None:
         self.told: dict[str, int] = {"tick": 0, "action": 0, "frames": 0, "answer": 0}
-        self.reason = ""
+        self.reason, self._fails, self._cannot = "", fails, cannot
 
     def tick(self, observed: Mapping[str, Any], action: Any) -> None:
+        if self._fails:
+            raise self._fails
         self.told["tick"] += 1
         self.told["action"] += action is not None
 
@@ -616,6 +597,8 @@ class Notes:
     def finish(self, reason: str, timings: Mapping[str, Any]) -> Path:
         self.reason = reason
         assert set(timings) == {"tick_ms", "answer_ms"}
+        if self._cannot:
+            raise self._cannot
         return Path("recording")
 
 
@@ -629,24 +612,12 @@ def test_all_that_happens_is_told_to_the_recorder() -> None:
     assert notes.reason == report.reason and report.recording == Path("recording")
 
 
-def test_a_recording_that_cannot_be_finished_hides_no_reason() -> None:
-    class Empty(Notes):
-        def finish(self, reason: str, timings: Mapping[str, Any]) -> Path:
-            raise RecordingError("no action was sent")
-
-    report = run_robot(Arm(), Brain(), replace(CALM, seconds=0.05), recorder=Empty())
+@pytest.mark.parametrize("cannot", [RecordingError("no action was sent"), ValueError("no codec")])
+def test_a_recording_that_cannot_be_finished_hides_no_reason(cannot: Exception) -> None:
+    short = replace(CALM, seconds=0.05)
+    report = run_robot(Arm(), Brain(), short, recorder=Notes(cannot=cannot))
     assert (report.kind, report.recording) == (StopKind.TIME, None)
-    assert report.traceback == "no recording: RecordingError: no action was sent"
-
-
-def test_whatever_keeps_a_recording_from_being_finished_is_told() -> None:
-    class Broken(Notes):
-        def finish(self, reason: str, timings: Mapping[str, Any]) -> Path:
-            raise ValueError("no such codec")
-
-    report = run_robot(Arm(), Brain(), replace(CALM, seconds=0.05), recorder=Broken())
-    assert (report.kind, report.recording) == (StopKind.TIME, None)
-    assert report.traceback == "no recording: ValueError: no such codec"
+    assert report.traceback == f"no recording: {type(cannot).__name__}: {cannot}"
 
 
 class Diary(Notes):
@@ -712,17 +683,15 @@ def test_parts_that_did_not_happen_in_a_tick_are_not_counted() -> None:
     assert "record" not in told and len(brain.asked) < report.ticks
 
 
-def test_limits_of_another_rate_are_refused_before_anything_is_asked() -> None:
+@pytest.mark.parametrize(
+    ("changed", "said"), [({"hz": 100.0}, r"hz=100, .* found 200"), ({"execute": 41}, "execute")]
+)
+def test_what_does_not_fit_is_refused_before_anything_is_asked(
+    changed: dict[str, Any], said: str
+) -> None:
     arm = Arm()
-    with pytest.raises(ConfigError, match=r"hz=100, .* found 200"):
-        run_robot(arm, Brain(), replace(CALM, hz=100.0), limits(step={"most": {"dx": 1}}))
-    assert not arm.ticks and not arm.stops
-
-
-def test_settings_that_do_not_fit_the_policy_are_refused_before_anything_is_asked() -> None:
-    arm = Arm()
-    with pytest.raises(ConfigError, match="execute"):
-        run_robot(arm, Brain(), replace(CALM, execute=HORIZON + 1))
+    with pytest.raises(ConfigError, match=said):
+        run_robot(arm, Brain(), replace(CALM, **changed), limits(step={"most": {"dx": 1}}))
     assert not arm.ticks and not arm.stops
 
 

@@ -58,11 +58,10 @@ def closing_code(bare: ClientConnection) -> int:
     return closed.value.rcvd.code
 
 
-@pytest.mark.parametrize("model_type", ["regression", "flow_matching"])
 def test_over_the_wire_is_bit_for_bit_what_it_is_in_process(
-    model_type: str, served_policy: Served, serving: Serving, observe: Observe
+    served_policy: Served, serving: Serving, observe: Observe
 ) -> None:
-    served = served_policy(model_type)
+    served = served_policy("flow_matching")
     here = served.session(seed=3)
     with client_of(serving(served, seed=3)) as client:
         assert client.metadata == served.metadata
@@ -141,11 +140,9 @@ def array_of(dtype: str, shape: Any, data: bytes) -> dict[bytes, Any]:
     [
         ("time", "refused: expected a message of bytes (msgpack), found a text", 1003),
         (b"", "refused: expected a message in msgpack, found none", 1007),
-        (b"\xdc\xff\xff", "refused: expected a message in msgpack, found none", 1007),
         (msgpack.packb({"time": array_of("|O", [1], b"0")}), "refused: expected the dtype", 1007),
         (msgpack.packb([1]), "refused: expected fields by name, found list", 1008),
         (wire.pack({"time": 0.1, "gripper": 1}), "refused: gripper: expected one of", 1008),
-        (wire.pack({"time": np.nan}), "refused: time: expected finite numbers", 1008),
     ],
 )
 def test_what_is_wrong_with_a_message_costs_its_connection_only(

@@ -212,7 +212,7 @@ def over_a_websocket(rng: np.random.Generator, address: str, fields: dict[str, A
 
 
 @pytest.mark.parametrize(
-    "messages", [300, pytest.param(10_000, marks=[pytest.mark.slow, pytest.mark.timeout(3000)])]
+    "messages", [150, pytest.param(10_000, marks=[pytest.mark.slow, pytest.mark.timeout(3000)])]
 )
 def test_broken_messages(
     messages: int,

@@ -48,9 +48,8 @@ def test_a_message_is_byte_for_byte_that_of_openpi_client() -> None:
 
 @pytest.mark.parametrize(
     "value",
-    [np.array([None]), np.array(["a"]), np.array([b"a"]), np.zeros(2, complex), np.zeros(2, "V4"),
-     np.zeros(2, [("a", "f4")]), np.array(["2020"], "M8[D]"), np.complex64(1), {1, 2}, object(),
-     2**70, np.longdouble(1)],
+    [np.array([None]), np.array(["a"]), np.zeros(2, complex), np.zeros(2, [("a", "f4")]),
+     np.array(["2020"], "M8[D]"), np.complex64(1), {1, 2}, 2**70, np.longdouble(1)],
 )  # fmt: skip
 def test_what_is_no_plain_number_is_not_sent(value: Any) -> None:
     with pytest.raises(WireError, match="cannot be sent"):
@@ -74,13 +73,9 @@ def number_of(dtype: Any, value: Any) -> bytes:
     ("data", "said"),
     [
         (b"", "expected a message in msgpack"),
-        (b"\xc1", "expected a message in msgpack"),
         (b"\xc0\xc0", "extra data"),
         (msgpack.packb({"a": 1})[:-1], "incomplete"),
-        (b"\xa1\xff", "expected a message in msgpack"),
         (b"\xdf\xff\xff\xff\xff", "expected a message in msgpack"),
-        (b"\xdd\xff\xff\xff\xff", "expected a message in msgpack"),
-        (b"\xc6\xff\xff\xff\xff", "expected a message in msgpack"),
         (b"\xd6\xff\0\0\0\0", "expected a message in msgpack"),
         (b"\x81\x01\x01", "expected a message in msgpack"),
         (b"\x91" * 100_000 + b"\xc0", "expected a message in msgpack"),
@@ -89,25 +84,16 @@ def number_of(dtype: Any, value: Any) -> bytes:
         (msgpack.packb("x" * 1_000_001), "expected a message in msgpack"),
         (pickle.dumps(Trap()), "expected a message in msgpack"),
         (array_of("|O", [1], pickle.dumps(Trap())), "found '|O'"),
-        (array_of("<U4", [1], b"0" * 16), "found '<U4'"),
-        (array_of("<c8", [1], b"0" * 8), "found '<c8'"),
-        (array_of("f4,f4", [1], b"0" * 8), "found 'f4,f4'"),
         (array_of(b"<f4", [1], b"0" * 4), "plain numbers"),
-        (array_of(None, [1], b"0" * 4), "plain numbers"),
         (array_of("<f4", [2], b"0" * 4), "expected 8 bytes"),
-        (array_of("<f4", [1], b"0" * 5), "expected 4 bytes"),
         (array_of("<f4", [2**62, 4], b""), "expected 73786976294838206464 bytes"),
         (array_of("<f4", [0, 2**62, 2**62], b""), "expected a message in msgpack"),
         (array_of("<f4", [-1], b""), "shape of an array"),
         (array_of("<f4", [True], b"0" * 4), "shape of an array"),
-        (array_of("<f4", [1.0], b"0" * 4), "shape of an array"),
-        (array_of("<f4", 1, b"0" * 4), "shape of an array"),
         (array_of("<f4", [1] * 9, b"0" * 4), "shape of an array"),
         (array_of("<f4", [1], "0000"), "expected 4 bytes for an array of float32, found str"),
-        (array_of("<f4", [1], None), "found NoneType"),
         (number_of("<i2", 70_000), "expected a message in msgpack"),
         (number_of("<i2", "7"), "expected a number"),
-        (number_of("|O", 7), "plain numbers"),
         (number_of("|u1", float("nan")), "expected a message in msgpack"),
     ],
 )  # fmt: skip

@@ -36,7 +36,7 @@ PLANTED = (
 )
 
 
-@pytest.mark.parametrize("guarded", [True, False])
+@pytest.mark.parametrize("guarded", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_a_page_that_asks_for_anything_is_not_sound(
     guarded: bool, tmp_path: Path, browser_page: Callable[..., Any]
 ) -> None:
