@@ -276,6 +276,7 @@ class TestStore:
 
 
 class TestDeaths:
+    @pytest.mark.slow
     def test_a_killed_worker_loses_one_batch(self, changed, workers, tmp_path, monkeypatch):
         def noted(self, rows, *args, mark=StoreBuild.mark):
             mark(self, rows, *args)
@@ -294,6 +295,7 @@ class TestDeaths:
         times, _ = workers.computed()
         assert 1 <= times.total() - len(times) <= BATCH
 
+    @pytest.mark.slow
     def test_a_worker_that_joins_later_takes_part(self, changed, workers, here, monkeypatch):
         mark = StoreBuild.mark
         joined: list[subprocess.Popen[bytes]] = []
@@ -485,6 +487,7 @@ class TestLocalProcesses:
                 with pytest.raises(HTTPError, match="404"):
                     urlopen(f"http://127.0.0.1:{port}/json/identity.json")
 
+    @pytest.mark.slow
     def test_ctrl_c_leaves_no_process_and_the_next_run_with_two_completes(
         self, changed, params_file, begin, here, tmp_path
     ):
@@ -525,7 +528,9 @@ class TestStart:
         with pytest.raises(PipelineError, match=r"extract\.workers: a worker died as it began"):
             run(changed(extract={"workers": workers.address}))
 
-    @pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGTERM])
+    @pytest.mark.parametrize(
+        "how", [pytest.param(signal.SIGINT, marks=pytest.mark.slow), signal.SIGTERM]
+    )
     def test_stopped_as_workers_start(self, params_file, begin, tmp_path, how):
         process = self.begun(begin, params_file, tmp_path)
         if how == signal.SIGINT:

@@ -302,7 +302,9 @@ def gathered(store: FeatureStore, ticks: list[int], answers) -> None:
 
 
 class TestProcesses:
-    @pytest.mark.parametrize("method", ["fork", "spawn", "forkserver"])
+    @pytest.mark.parametrize(
+        "method", ["fork", pytest.param("spawn", marks=pytest.mark.slow), "forkserver"]
+    )
     def test_workers_gather_what_their_parent_gathers(self, path, method):
         store = FeatureStore.open(path)
         store.gather([0])
