@@ -153,7 +153,7 @@ def test_another_store_or_other_ticks_are_refused_by_name(
     assert "[3, 30] (regression-gated)" in error
 
 
-@pytest.mark.parametrize(("key", "value"), [("samples", 16), ("batch_size", 8)])
+@pytest.mark.parametrize(("key", "value"), [("batch_size", 8)])
 def test_policies_that_were_sampled_otherwise_are_refused(
     reports: Path, experiments: Path, capsys: pytest.CaptureFixture[str], key: str, value: int
 ) -> None:
@@ -170,21 +170,9 @@ def test_policies_that_were_sampled_otherwise_are_refused(
     assert len(read_experiments(reports)) == 3
 
 
-def test_other_baselines_are_refused(
-    reports: Path, experiments: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    path = reports / "regression-gated" / "groups.csv"
-    rows = list(csv.DictReader(path.read_text().splitlines()))
-    text = path.read_text().replace(rows[0]["median_action_overall"], "7.5")
-    path.write_text(text)
-    error = refused(reports, experiments, capsys)
-    assert "found median_action (the whole chunk)" in error
-    assert "trained on other recordings" in error
-
-
 @pytest.mark.parametrize(
     ("name", "torn"),
-    [(JUDGED, "{"), (JUDGED, "{}"), ("groups.csv", "group,policy_executed\na,x\n")],
+    [(JUDGED, "{}"), ("groups.csv", "group,policy_executed\na,x\n")],
 )
 def test_a_folder_that_is_no_evaluation_is_named(
     reports: Path, experiments: Path, capsys: pytest.CaptureFixture[str], name: str, torn: str

@@ -57,13 +57,6 @@ def test_an_empty_glob(capsys, params_file, tmp_path):
     assert str(tmp_path) in err
 
 
-def test_a_folder_without_episodes(capsys, params_file, tmp_path):
-    (tmp_path / "day1" / "run").mkdir(parents=True)
-    err = said(capsys, params_file)
-    assert "none with an episode" in err
-    assert "metadata.json" in err
-
-
 def test_an_unknown_codebase_version(capsys, params_file, tmp_path):
     meta = tmp_path / "day1/run/meta"
     meta.mkdir(parents=True)
@@ -146,8 +139,7 @@ def test_a_clock_whose_type_is_too_coarse(capsys, params_file, tmp_path):
     )
 
 
-@pytest.mark.parametrize("dtype", ["float32", "float16"])
-@pytest.mark.parametrize("name", ["sensor", "state"])
+@pytest.mark.parametrize(("name", "dtype"), [("sensor", "float32"), ("state", "float16")])
 def test_the_clock_of_a_sidecar_may_be_narrow_where_it_begins_at_zero(
     capsys, params_file, tmp_path, name, dtype
 ):
@@ -240,8 +232,13 @@ def _png(frame: Path) -> None:
     frame.unlink()
 
 
-@pytest.mark.parametrize("write", [write_new, partial(write_raw, views=("View1", "View2"))])
-@pytest.mark.parametrize("change", ["all PNGs", "PNGs in one view", "view2/"])
+RAW = partial(write_raw, views=("View1", "View2"))
+
+
+@pytest.mark.parametrize(
+    ("write", "change"),
+    [(write_new, "all PNGs"), (write_new, "view2/"), (RAW, "PNGs in one view"), (RAW, "view2/")],
+)
 def test_no_camera_vanishes(capsys, params_file, tmp_path, write, change):
     folder = write(tmp_path / "day1/run/episode", Truth())
     for frame in [*folder.rglob("View[12]/*.jpg")]:
@@ -343,7 +340,7 @@ def test_channel_names_of_two_embodiments_are_shown_without_control_characters(
     assert "\x1b" not in err
 
 
-@pytest.mark.parametrize("path", ["/", "/**", "/*", "../" * 30 + "**"])
+@pytest.mark.parametrize("path", ["/*", "../" * 30 + "**"])
 def test_a_path_that_is_the_whole_file_system(capsys, params_file, path):
     err = said(capsys, params_file, f"data.sources=[{{name: lab, path: {path}}}]")
     assert f"found '{path}', the whole file system. Set the source's path to the folder" in err

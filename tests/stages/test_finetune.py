@@ -179,6 +179,7 @@ def test_it_tunes_and_says_how_to_go_on_and_that_works(
     assert "feature_spec.adapter" in capsys.readouterr().err, "these features are not the tuned"
 
 
+@pytest.mark.slow
 def test_killed_in_mid_run_it_ends_where_an_undisturbed_run_ends(
     started_until: Start,
     write_params: Callable[..., Path],

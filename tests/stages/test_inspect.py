@@ -57,19 +57,6 @@ def test_recordings_and_a_damaged_one_are_a_page(
     assert page.is_file() and len(list(page.parent.glob("*.png"))) >= 3
 
 
-def test_grey_frames_of_16_bits_are_not_white(
-    looked: Callable[..., int], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    episode = write_raw(tmp_path / "lab/one", Truth(), views=("View1",))
-    for number, frame in enumerate(sorted(episode.rglob("*.jpg"))):
-        frame.with_suffix(".png").write_bytes(png(20 + 30 * number, grey_of_16_bits=True))
-        frame.unlink()
-    few = ("inspect.samples=1", "inspect.ticks=1")
-    assert looked("lab", *(word for one in few for word in ("--set", one))) == 0
-    out = capsys.readouterr().out
-    assert "cameras 1" in out and "of one colour" not in out
-
-
 @pytest.mark.parametrize("version", [2, 3])
 def test_a_zarr_group_of_somebody_else_is_told_and_not_to_be_replaced(
     looked: Callable[..., int], tmp_path: Path, capsys: pytest.CaptureFixture[str], version: int
@@ -83,27 +70,25 @@ def test_a_zarr_group_of_somebody_else_is_told_and_not_to_be_replaced(
     assert "extract.store=" not in said
 
 
-@pytest.mark.parametrize("alone", [False, True])
-def test_a_korean_name_is_drawn_or_said_to_lack_a_font(
+def test_a_korean_name_lacks_a_font_and_grey_frames_of_16_bits_are_not_white(
     looked: Callable[..., int],
-    recorded: Path,
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
-    alone: bool,
 ) -> None:
-    (episode,) = recorded.iterdir()
-    shutil.copytree(episode, tmp_path / "바늘_삽입")
-    if alone:
-        monkeypatch.setitem(RC, "font.family", ["DejaVu Sans"])
+    """Where a warning a letter came through, it would be an error here."""
+    episode = write_raw(tmp_path / "바늘_삽입", Truth(), views=("View1",))
+    for number, frame in enumerate(sorted(episode.rglob("*.jpg"))):
+        frame.with_suffix(".png").write_bytes(png(20 + 30 * number, grey_of_16_bits=True))
+        frame.unlink()
+    monkeypatch.setitem(RC, "font.family", ["DejaVu Sans"])
     few = ("inspect.samples=1", "inspect.ticks=1", "inspect.output=mine")
-    # Where a warning a letter came through, it would be an error here.
     assert looked("바늘_삽입", *(word for one in few for word in ("--set", one))) == 0
-    lacking = len(RC["font.family"]) == 1
     out = capsys.readouterr().out
-    assert out.count("fonts-noto-cjk") == lacking
+    assert "cameras 1" in out and "of one colour" not in out
+    assert out.count("fonts-noto-cjk") == 1
     page = (tmp_path / "mine/report.html").read_text(encoding="utf-8")
-    assert page.count("fonts-noto-cjk") == lacking and "바늘_삽입" in page
+    assert page.count("fonts-noto-cjk") == 1 and "바늘_삽입" in page
 
 
 def test_a_store_is_a_page(

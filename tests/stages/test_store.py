@@ -2,7 +2,6 @@
 
 import os
 import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -16,7 +15,6 @@ from stages import train_head
 from stages.command import run
 
 Make = Callable[..., Path]
-ROOT = Path(stage.__file__).parents[1]
 
 
 @pytest.fixture
@@ -151,15 +149,9 @@ def test_gc_lists_and_removes_only_when_told_to(
 
 
 def test_without_a_word_it_lists_and_progress_is_silent(
-    params: Path, tiny_store: Make, tmp_path: Path
+    params: Path, tiny_store: Make, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     tiny_store(tmp_path / "stores", name="one")
-    done = subprocess.run(
-        [sys.executable, "-m", "stages.store", "--params", str(params)],
-        capture_output=True,
-        text=True,
-        check=True,
-        env=os.environ | {"PYTHONPATH": str(ROOT)},
-    )
-    assert "one.zarr" in done.stdout
-    assert done.stderr == ""
+    assert command(params) == 0
+    said = capsys.readouterr()
+    assert "one.zarr" in said.out and said.err == ""

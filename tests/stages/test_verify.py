@@ -53,7 +53,7 @@ def test_a_sound_store(verified, store, capsys):
     assert said.out.endswith(f"{store}: sound\n")
 
 
-@pytest.mark.parametrize("address", ["nonsense://here", "tcp://127.0.0.1:9", "tls://127.0.0.1:9"])
+@pytest.mark.parametrize("address", ["nonsense://here", "tcp://127.0.0.1:9"])
 def test_an_address_where_no_scheduler_answers(verified, capsys, monkeypatch, address):
     monkeypatch.setattr("pipeline.base.scheduler.TIMEOUT_S", 0.5)
     assert verified("--set", f"verify.workers={address}") == 2

@@ -236,6 +236,7 @@ def test_two_processes_follow_the_curve_of_one_that_accumulates(
     trainer: Make,
     write: Make,
     script: Path,
+    two_ranks: Callable[..., str],
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -250,12 +251,9 @@ def test_two_processes_follow_the_curve_of_one_that_accumulates(
         "loggers": ["tensorboard"],
     }
     together = write("together", grad_accumulation=2, **chosen)
-    process = torchrun(script, json.dumps(case(together)))
-    alone = write("alone", grad_accumulation=4, **chosen)
+    out = two_ranks(script, json.dumps(case(together)))
     monkeypatch.setattr("pipeline.train.loop.LOG_EVERY", 1)
-    done = train_alone(trainer, store, alone)
-    out, err = process.communicate()
-    assert process.returncode == 0, err
+    done = train_alone(trainer, store, write("alone", grad_accumulation=4, **chosen))
     assert "device cpu on 2 processes" in out
     assert out.count("parameters") == 1, "one process speaks"
     assert f"stopped early at step {done.step}" in out
@@ -319,6 +317,7 @@ def test_what_goes_wrong_is_said_once_and_nobody_waits(
         assert quiet[1] == ""
 
 
+@pytest.mark.slow
 def test_a_process_that_fails_alone_ends_torchrun(write: Make, script: Path) -> None:
     process = torchrun(script, json.dumps(case(write("together"), fails="step 1")))
     _, err = process.communicate()

@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 import torch
 
-from pipeline.base.config import TrainHeadParams
 from pipeline.base.errors import NumericsError, StoreIncomplete
 from pipeline.base.files import read_document
 from pipeline.policy.checkpoint import load_policy
@@ -62,7 +61,7 @@ def undisturbed(
     return done
 
 
-@pytest.mark.parametrize("stopped", [1, 5, 8, 13, 20])
+@pytest.mark.parametrize("stopped", [1, 13, 20])
 def test_killed_at_any_step_it_ends_the_same(
     store: FeatureStore,
     params: Make,
@@ -102,38 +101,33 @@ def test_killed_at_any_step_it_ends_the_same(
     assert (logs / "metrics.json").read_text() == (whole / "metrics.json").read_text()
 
 
-@pytest.mark.parametrize(("number", "every"), [(signal.SIGINT, 5), (signal.SIGTERM, 13)])
 def test_a_signal_ends_the_step_and_saves_once(
     store: FeatureStore,
     params: Make,
     trainer: Make,
     undisturbed: Trainer,
     monkeypatch: pytest.MonkeyPatch,
-    number: signal.Signals,
-    every: int,
 ) -> None:
-    real = Trainer._train_step
+    real, save = Trainer._train_step, Trainer._save_last
+    saved: list[int] = []
 
     def signalled(self: Trainer, *rest: Any) -> bool:
         if self.step == 12:
-            os.kill(os.getpid(), number)
+            os.kill(os.getpid(), signal.SIGTERM)
         return real(self, *rest)
-
-    saved: list[int] = []
-    save = Trainer._save_last
 
     def counted(self: Trainer, *rest: Any) -> None:
         saved.append(self.step)
         save(self, *rest)
 
-    before = signal.getsignal(number)
+    before = signal.getsignal(signal.SIGTERM)
     with monkeypatch.context() as patched:
         patched.setattr(Trainer, "_train_step", signalled)
         patched.setattr(Trainer, "_save_last", counted)
         with pytest.raises(KeyboardInterrupt):
-            trainer(store, params(checkpoint_every=every)).fit()
-    assert saved == ([5, 10, 13] if every == 5 else [13]), "also where a checkpoint was due"
-    assert signal.getsignal(number) is before
+            trainer(store, params(checkpoint_every=13)).fit()
+    assert saved == [13], "also where a checkpoint is due"
+    assert signal.getsignal(signal.SIGTERM) is before
     resumed = trainer(store, params())
     assert resumed.step == 13
     resumed.fit()
@@ -170,10 +164,10 @@ def test_what_a_finished_run_leaves(undisturbed: Trainer, store: FeatureStore) -
 
 
 def test_it_learns_what_the_store_says(store: FeatureStore, params: Make, trainer: Make) -> None:
-    steps = {"max_steps": 80, "eval_every": 80, "checkpoint_every": 80}
-    done = trainer(store, params(horizon=1, batch_size=32, lr=2e-2, **steps))
+    steps = {"max_steps": 50, "eval_every": 50, "checkpoint_every": 50}
+    done = trainer(store, params(horizon=1, batch_size=24, lr=2e-2, **steps))
     done.fit()
-    assert np.mean(losses(done)[-20:]) < 0.65 * np.mean(losses(done)[:10])
+    assert np.mean(losses(done)[-10:]) < 0.65 * np.mean(losses(done)[:10])
 
 
 def test_without_held_out_episodes_the_best_is_the_newest(
@@ -196,7 +190,7 @@ def test_nothing_in_training_looks_at_test(
         store = FeatureStore.open(tiny_store(tmp_path / name))
         given = {"split": {"val": 0.3, "test": 0.3}, "early_stopping": 2}
         folders = {"output": tmp_path / name / "head", "logs": tmp_path / name / "logs"}
-        done = trainer(store, params(max_steps=24, **given, **folders))
+        done = trainer(store, params(max_steps=12, eval_every=4, **given, **folders))
         for episode in {store.episodes[i] for i in store.episode_of(done.split.test)}:
             for array, rows in (
                 ("tick/action", episode.ticks),
@@ -217,14 +211,12 @@ def test_nothing_in_training_looks_at_test(
         assert all(torch.equal(spoilt.weights[name], plain.weights[name]) for name in plain.weights)
 
 
-@pytest.mark.parametrize("disabled", ["features_enabled", "sensor_enabled", "robot_state_enabled"])
-def test_any_stream_may_be_left_out(
-    store: FeatureStore, params: Make, trainer: Make, disabled: str
-) -> None:
-    done = trainer(store, params(max_steps=3, **{disabled: False}))
-    assert any(f"disabled by train_head.{disabled}" in line for line in done.summary())
-    done.fit()
-    assert len(losses(done)) == 3
+def test_any_stream_may_be_left_out(store: FeatureStore, params: Make, trainer: Make) -> None:
+    for disabled in ("features_enabled", "sensor_enabled", "robot_state_enabled"):
+        done = trainer(store, params(max_steps=1, seed=len(disabled), **{disabled: False}))
+        assert any(f"disabled by train_head.{disabled}" in line for line in done.summary())
+        done.fit()
+        assert len(losses(done)) == 1
 
 
 def test_a_loss_that_is_not_finite_names_step_and_ticks(
@@ -245,23 +237,20 @@ def test_a_loss_that_is_not_finite_names_step_and_ticks(
     assert read_trainer(stopped.run.last)[0].step == 5
 
 
-@pytest.mark.parametrize("place", ["plain", "git", "git and dvc"])
 def test_logs_need_no_repository_and_change_none(
     store: FeatureStore,
     params: Make,
     trainer: Make,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
-    place: str,
 ) -> None:
-    if "git" in place:  # a repository without a commit, which dvclive itself cannot bear
-        subprocess.run(["git", "init", "-q", str(tmp_path)], check=True)
-    if "dvc" in place:
-        (tmp_path / ".dvc").mkdir()
-    before = sorted(os.listdir(tmp_path))
+    """A repository without a commit, which dvclive itself cannot bear."""
+    subprocess.run(["git", "init", "-q", str(tmp_path)], check=True)
+    (tmp_path / ".dvc").mkdir()
     monkeypatch.chdir(tmp_path)
     trainer(store, params(max_steps=1)).fit()
-    assert sorted({*before, "head", "logs", "logs.speed.tsv"}) == sorted(os.listdir(tmp_path))
+    found = {".git", ".dvc", "head", "logs", "logs.speed.tsv"}
+    assert found == set(os.listdir(tmp_path))
     assert json.loads((tmp_path / "logs/metrics.json").read_text())["step"] == 1
 
 
@@ -288,19 +277,6 @@ def test_the_golden_run(undisturbed: Trainer) -> None:
     assert found == golden["losses"].get(machine, found), changed
     for kept in golden["losses"].values():
         assert found == pytest.approx(kept, rel=1e-4), changed
-
-
-def test_two_fresh_runs_are_equal_to_the_bit(
-    store: FeatureStore, params: Callable[..., TrainHeadParams], trainer: Make, undisturbed: Trainer
-) -> None:
-    again = trainer(store, params())
-    again.fit()
-    assert losses(again) == losses(undisturbed)
-    assert same_weights(again, undisturbed)
-    # Another seed is another run.
-    other = trainer(store, params(seed=1, max_steps=1))
-    other.fit()
-    assert losses(other)[0] != losses(undisturbed)[0]
 
 
 def test_autocast_trains_in_bfloat16(store: FeatureStore, params: Make, trainer: Make) -> None:

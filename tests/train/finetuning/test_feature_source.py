@@ -56,7 +56,7 @@ def test_all_that_learns_does_at_its_own_rate_and_the_loss_falls(
     still = {"dim": 16, "layers": 1, "heads": 2, "dropout": 0.0}
     given = params(
         train_head={"expert": still, "lr_schedule": "constant"},
-        finetune={"batch_size": 12, "max_steps": 40, "eval_every": 40, "checkpoint_every": 40},
+        finetune={"batch_size": 8, "max_steps": 24, "eval_every": 24, "checkpoint_every": 24},
     )
     made = trainer(given)
     names = {id(p): n for n, p in made.module.named_parameters()}
@@ -73,7 +73,7 @@ def test_all_that_learns_does_at_its_own_rate_and_the_loss_falls(
     after = weights(made.module)
     assert [n for n in before if torch.equal(before[n], after[n])] == []
     losses = made.history.tensor()[:, made.history.columns.index("loss")]
-    assert losses[-8:].mean() < 0.7 * losses[:8].mean()
+    assert losses[-6:].mean() < 0.7 * losses[:6].mean()
 
 
 def test_what_is_kept_is_the_averaged_model_that_was_judged(
@@ -181,22 +181,19 @@ def test_parts_of_a_step_give_the_whole_step(params: Callable[..., Params], tmp_
     torch.testing.assert_close(losses[0], losses[1], atol=1e-4, rtol=1e-3)
 
 
-@pytest.mark.parametrize(
-    ("changed", "another"),
-    [
-        ({"lr": 2e-3}, True),
-        ({"tuning": {"lora_r": 4, "lora_alpha": 8, "towers": ["vision"]}}, True),
-        ({"tuning": {"lora_r": 4, "lora_alpha": 8, "gradient_checkpointing": False}}, False),
-        ({"decode_threads": 1}, False),
-    ],
-)
 def test_a_setting_that_decides_the_numbers_is_another_run(
-    store: FeatureStore, params: Callable[..., Params], changed: dict[str, Any], another: bool
+    store: FeatureStore, params: Callable[..., Params]
 ) -> None:
     before = ModelFeatureSource(store, params(), CPU).identity
-    after = ModelFeatureSource(store, params(finetune=changed), CPU).identity
-    assert (before != after) == another
     json.dumps(before)
+    small = {"lora_r": 4, "lora_alpha": 8}
+    for changed, another in (
+        ({"lr": 2e-3}, True),
+        ({"tuning": {**small, "towers": ["vision"]}}, True),
+        ({"tuning": {**small, "gradient_checkpointing": False}, "decode_threads": 1}, False),
+    ):
+        after = ModelFeatureSource(store, params(finetune=changed), CPU).identity
+        assert (before != after) == another, changed
 
 
 def test_full_tuning_saves_a_checkpoint_to_extract_with(

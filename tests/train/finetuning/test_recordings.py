@@ -54,12 +54,6 @@ def test_a_missing_recording_is_named(
     assert "python -m stages.extract" in said
 
 
-def test_a_source_that_is_gone_is_named(store: FeatureStore, params: Callable[..., Params]) -> None:
-    renamed = params(data={"sources": [{"name": "other", "path": "."}]})
-    with pytest.raises(StoreMismatch, match=r"made/episode_0: no source has it"):
-        find_recordings(store, renamed)
-
-
 def test_a_changed_file_is_named(
     store: FeatureStore, params: Callable[..., Params], own_recordings: Path
 ) -> None:
@@ -97,7 +91,6 @@ def test_the_model_of_the_store_is_asked_for(
 @pytest.mark.parametrize(
     ("changed", "entry"),
     [
-        ({"prompt": "{instruction}"}, "prompt: "),
         ({"pooling": ["last"]}, "slots: "),
         ({"image_resize_height": 84}, "processor.image_size"),
     ],
