@@ -37,6 +37,8 @@ from pipeline.vlm.live import LiveVLM, live_spec
 from pipeline.vlm.preparation import Preparer
 from pipeline.vlm.qwen import FrozenVLM
 
+Make = Callable[..., Any]
+
 VIEWS = ("View1", "View2")
 TEXT = ["insert the needle", "stop", "insert the needle", "retract"]
 SMALL: dict[str, Any] = {
@@ -66,7 +68,7 @@ def small_policy(shape: PolicyShape) -> Policy:
 
 
 @pytest.fixture
-def build(demo_checkpoint: Path) -> Callable[..., QwenVLAUnified]:
+def build(demo_checkpoint: Path) -> Make:
     """`build(**arguments)`: a small unified model on the demo's checkpoint, from a fixed seed."""
 
     def make(kind: type[QwenVLAUnified] = QwenVLAUnified, **arguments: Any) -> QwenVLAUnified:
@@ -106,10 +108,7 @@ def _cached(
 
 @pytest.mark.parametrize("model_type", ["regression", "flow_matching"])
 def test_live_cached_and_mixed_give_the_same_chunk(
-    build: Callable[..., QwenVLAUnified],
-    images: list[Any],
-    streams: dict[str, Tensor],
-    model_type: str,
+    build: Make, images: list[Any], streams: dict[str, Tensor], model_type: str
 ) -> None:
     model = build(model_type=model_type)
     features, slot_valid = _cached(model, images)
@@ -135,7 +134,7 @@ def test_live_cached_and_mixed_give_the_same_chunk(
 
 
 def test_bfloat16_live_and_cached_agree_within_its_noise(
-    build: Callable[..., QwenVLAUnified], images: list[Any], streams: dict[str, Tensor]
+    build: Make, images: list[Any], streams: dict[str, Tensor]
 ) -> None:
     model = build(model_type="regression", vlm={"dtype": "bfloat16"})
     features, slot_valid = _cached(model, images, "bfloat16")
@@ -144,7 +143,7 @@ def test_bfloat16_live_and_cached_agree_within_its_noise(
     assert ((live - cached).norm() / cached.norm()) < 0.03
 
 
-def test_equal_samples_share_a_row(build: Callable[..., QwenVLAUnified], images: list[Any]) -> None:
+def test_equal_samples_share_a_row(build: Make, images: list[Any]) -> None:
     model = build()
     observation = model.observe(images, TEXT)
     assert isinstance(observation, LiveObservation)
@@ -160,9 +159,7 @@ def test_equal_samples_share_a_row(build: Callable[..., QwenVLAUnified], images:
     assert batches == [3]
 
 
-def test_what_is_not_given_is_missing(
-    build: Callable[..., QwenVLAUnified], streams: dict[str, Tensor]
-) -> None:
+def test_what_is_not_given_is_missing(build: Make, streams: dict[str, Tensor]) -> None:
     model = build()
     observation = model.observe(sensor=streams["sensor"])
     assert not observation.slot_valid.any()
@@ -172,23 +169,21 @@ def test_what_is_not_given_is_missing(
 
 
 def test_a_stream_without_an_encoder_is_not_looked_at(
-    build: Callable[..., QwenVLAUnified], streams: dict[str, Tensor]
+    build: Make, streams: dict[str, Tensor]
 ) -> None:
     model = build(model_type="regression", sensor_enabled=False)
     torch.testing.assert_close(model(**streams), model(state=streams["state"]))
     assert model(sensor=torch.randn(3, 2), state=streams["state"]).shape == (4, 8, 7)
 
 
-def test_a_misspelt_argument_is_refused(
-    build: Callable[..., QwenVLAUnified], streams: dict[str, Tensor]
-) -> None:
+def test_a_misspelt_argument_is_refused(build: Make, streams: dict[str, Tensor]) -> None:
     model = build()
     for door in (model, model.observe):
         with pytest.raises(TypeError, match="sensor_vaild"):
             door(**streams, sensor_vaild=torch.ones(4))
 
 
-def test_nothing_to_look_at_is_refused(build: Callable[..., QwenVLAUnified]) -> None:
+def test_nothing_to_look_at_is_refused(build: Make) -> None:
     model, blind = build(), build(sensor_enabled=False)
     for given in ({"images": [None, None]}, {"text": TEXT}, {"actions": torch.randn(4, 8, 7)}):
         with pytest.raises(ObservationError, match="at least one of features, sensor, state"):
@@ -199,7 +194,7 @@ def test_nothing_to_look_at_is_refused(build: Callable[..., QwenVLAUnified]) -> 
 
 @pytest.mark.parametrize("to", [torch.Tensor.numpy, torch.Tensor.tolist])
 def test_validity_is_taken_as_a_store_has_it(
-    build: Callable[..., QwenVLAUnified], streams: dict[str, Tensor], to: Callable[[Tensor], Any]
+    build: Make, streams: dict[str, Tensor], to: Callable[[Tensor], Any]
 ) -> None:
     model = build(model_type="regression")
     features = torch.randn(4, 3, 128)
@@ -219,9 +214,7 @@ def test_validity_is_taken_as_a_store_has_it(
     assert torch.equal(*losses)
 
 
-def test_a_shape_that_does_not_fit_is_named(
-    build: Callable[..., QwenVLAUnified], streams: dict[str, Tensor]
-) -> None:
+def test_a_shape_that_does_not_fit_is_named(build: Make, streams: dict[str, Tensor]) -> None:
     model = build()
     for given, message in (
         ({"features": (4, 3, 100)}, r"features: .*slot 3, dim 128\), found \(4, 3, 100"),
@@ -241,7 +234,7 @@ def test_a_shape_that_does_not_fit_is_named(
 
 
 def test_images_text_and_streams_are_of_one_batch(
-    build: Callable[..., QwenVLAUnified], images: list[Any], streams: dict[str, Tensor]
+    build: Make, images: list[Any], streams: dict[str, Tensor]
 ) -> None:
     model = build()
     for text in (None, TEXT[:3], "stop"):
@@ -254,10 +247,7 @@ def test_images_text_and_streams_are_of_one_batch(
 
 @pytest.mark.parametrize("model_type", ["diffusion"])
 def test_a_fresh_model_acts_without_dropout(
-    build: Callable[..., QwenVLAUnified],
-    images: list[Any],
-    streams: dict[str, Tensor],
-    model_type: str,
+    build: Make, images: list[Any], streams: dict[str, Tensor], model_type: str
 ) -> None:
     over: dict[str, Any] = {"expert": SMALL["expert"] | {"dropout": 0.5}, "drop_sensor": 0.5}
     model = build(model_type=model_type, finetune_vl="lora", **over).train()
@@ -285,7 +275,7 @@ def test_a_fresh_model_acts_without_dropout(
 
 
 def test_it_is_trainable_and_gives_the_loss_where_actions_are_given(
-    build: Callable[..., QwenVLAUnified], images: list[Any], streams: dict[str, Tensor]
+    build: Make, images: list[Any], streams: dict[str, Tensor]
 ) -> None:
     model = build(model_type="diffusion")
     assert isinstance(model, Trainable)
@@ -315,9 +305,7 @@ def _generator() -> torch.Generator:
 
 
 @pytest.mark.parametrize("finetune_vl", ["lora", "full"])
-def test_tuning_lowers_the_loss(
-    build: Callable[..., QwenVLAUnified], images: list[Any], finetune_vl: str
-) -> None:
+def test_tuning_lowers_the_loss(build: Make, images: list[Any], finetune_vl: str) -> None:
     model = build(model_type="regression", finetune_vl=finetune_vl, lora_dropout=0.0).train()
     # Only the vision-language model learns, and an optimizer sees it without asking for it.
     model.policy.requires_grad_(False)
@@ -340,7 +328,7 @@ def test_tuning_lowers_the_loss(
 
 @pytest.mark.parametrize("finetune_vl", ["none", "lora"])
 def test_a_state_dict_restores_it_in_a_fresh_model(
-    build: Callable[..., QwenVLAUnified], images: list[Any], finetune_vl: str
+    build: Make, images: list[Any], finetune_vl: str
 ) -> None:
     """Whether or not the model in front was loaded when it was saved, and when it is restored."""
     saved = build(model_type="regression", finetune_vl=finetune_vl)
@@ -358,7 +346,7 @@ def test_a_state_dict_restores_it_in_a_fresh_model(
         restored.load_state_dict({})
 
 
-def test_of_two_parts(build: Callable[..., QwenVLAUnified], images: list[Any]) -> None:
+def test_of_two_parts(build: Make, images: list[Any]) -> None:
     whole = build(finetune_vl="lora")
     vlm = whole.load_vlm()
     model = QwenVLAUnified.of(whole.policy, vlm).eval()
@@ -428,11 +416,7 @@ def _live(vlm: VLMParams, views: Sequence[str] = VIEWS) -> LiveVLM:
     ],
 )
 def test_a_live_model_of_other_features_than_the_policy_s_is_refused(
-    trained: Callable[..., Policy],
-    demo_checkpoint: Path,
-    live: dict[str, Any],
-    views: tuple[str, ...],
-    said: str,
+    trained: Make, demo_checkpoint: Path, live: dict[str, Any], views: tuple[str, ...], said: str
 ) -> None:
     vlm = SEEN.model_copy(update={"checkpoint": str(demo_checkpoint), **live})
     with pytest.raises(CheckpointMismatch, match=said):
@@ -440,7 +424,7 @@ def test_a_live_model_of_other_features_than_the_policy_s_is_refused(
 
 
 def test_a_live_model_of_other_weights_is_refused(
-    trained: Callable[..., Policy], demo_checkpoint: Path, tmp_path: Path
+    trained: Make, demo_checkpoint: Path, tmp_path: Path
 ) -> None:
     other = shutil.copytree(demo_checkpoint, tmp_path / "other")
     vlm = SEEN.model_copy(update={"checkpoint": str(other)})
@@ -457,7 +441,7 @@ def test_a_live_model_of_other_weights_is_refused(
 
 @pytest.mark.parametrize(("storage_dtype", "variants"), [("float16", 1), ("bfloat16", 2)])
 def test_how_features_were_stored_makes_no_live_ones_others(
-    trained: Callable[..., Policy], demo_checkpoint: Path, storage_dtype: str, variants: int
+    trained: Make, demo_checkpoint: Path, storage_dtype: str, variants: int
 ) -> None:
     vlm = SEEN.model_copy(update={"checkpoint": str(demo_checkpoint)})
     policy = trained(storage_dtype, variants=variants)
@@ -489,7 +473,7 @@ def test_the_arguments_it_has_always_had() -> None:
 
 
 def test_a_part_that_is_named_in_part_keeps_the_rest_of_it(
-    build: Callable[..., QwenVLAUnified],
+    build: Make,
 ) -> None:
     params = build(expert={"dim": 32, "heads": 2}, state_encoder={"dim": 16}).policy.params
     assert (params.expert.dim, params.expert.heads, params.expert.layers) == (32, 2, 4)
@@ -498,7 +482,7 @@ def test_a_part_that_is_named_in_part_keeps_the_rest_of_it(
         build(expert=None)
 
 
-def test_every_fusion(build: Callable[..., QwenVLAUnified], streams: dict[str, Tensor]) -> None:
+def test_every_fusion(build: Make, streams: dict[str, Tensor]) -> None:
     for fusion in ("concat", "cross_attention", "gated", "none"):
         model = build(fusion_strategy=fusion)
         assert model(features=torch.randn(4, 3, 128), **streams).shape == (4, 8, 7)
@@ -513,10 +497,7 @@ def test_every_fusion(build: Callable[..., QwenVLAUnified], streams: dict[str, T
     ],
 )
 def test_aliases_build_the_right_thing(
-    build: Callable[..., QwenVLAUnified],
-    alias: type[QwenVLAUnified],
-    model_type: str,
-    finetune_vl: str,
+    build: Make, alias: type[QwenVLAUnified], model_type: str, finetune_vl: str
 ) -> None:
     model = build(alias, horizon=4)
     assert isinstance(model, QwenVLAUnified)
@@ -526,7 +507,7 @@ def test_aliases_build_the_right_thing(
     assert learns == (finetune_vl == "full")
 
 
-def test_a_wrong_argument_is_refused(build: Callable[..., QwenVLAUnified]) -> None:
+def test_a_wrong_argument_is_refused(build: Make) -> None:
     with pytest.raises(ValidationError, match="horizont"):
         build(horizont=4)
     with pytest.raises(ValidationError, match="lora_r"):

@@ -9,6 +9,9 @@ from pipeline.simulation import demo_recordings
 from pipeline.vlm import demo_checkpoint
 from stages import command, demo
 
+Patch = pytest.MonkeyPatch
+Said = pytest.CaptureFixture[str]
+
 
 @pytest.fixture
 def params(tmp_path: Path) -> Path:
@@ -32,10 +35,7 @@ def write_weights(folder: Path, seed: int) -> None:
 
 
 def test_writes_recordings_and_checkpoint(
-    params: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    params: Path, tmp_path: Path, monkeypatch: Patch, capsys: Said
 ) -> None:
     calls: list[tuple[object, ...]] = []
     monkeypatch.setattr(
@@ -52,10 +52,7 @@ def test_writes_recordings_and_checkpoint(
 
 
 def test_stopped_while_it_writes_the_same_command_goes_on(
-    params: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    params: Path, tmp_path: Path, monkeypatch: Patch, capsys: Said
 ) -> None:
     def stopped(folder: Path, seed: int) -> None:
         write_weights(folder, seed)
@@ -72,10 +69,7 @@ def test_stopped_while_it_writes_the_same_command_goes_on(
 
 
 def test_a_checkpoint_that_the_demo_did_not_write_is_left_alone(
-    params: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    params: Path, tmp_path: Path, monkeypatch: Patch, capsys: Said
 ) -> None:
     monkeypatch.setattr(demo_checkpoint, "write_demo_checkpoint", write_weights)
     (tmp_path / "vlm").mkdir()
@@ -88,7 +82,7 @@ def test_a_checkpoint_that_the_demo_did_not_write_is_left_alone(
 
 
 def test_foreign_recordings_end_with_2_and_no_checkpoint(
-    params: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    params: Path, tmp_path: Path, capsys: Said
 ) -> None:
     (tmp_path / "recordings" / "precious").mkdir(parents=True)
     assert command.run("", demo.main, ["--params", str(params)]) == 2
@@ -97,10 +91,7 @@ def test_foreign_recordings_end_with_2_and_no_checkpoint(
 
 
 def test_what_a_user_put_among_the_demos_files_is_left_alone(
-    params: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    params: Path, tmp_path: Path, monkeypatch: Patch, capsys: Said
 ) -> None:
     monkeypatch.setattr(demo_recordings, "write_demo_recordings", lambda *given: None)
     monkeypatch.setattr(demo_checkpoint, "write_demo_checkpoint", write_weights)

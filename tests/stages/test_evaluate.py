@@ -20,6 +20,8 @@ from pipeline.store.chunks import write_seal
 from stages import evaluate, train_head
 from stages.command import run
 
+Said = pytest.CaptureFixture[str]
+
 ROOT = Path(__file__).resolve().parents[2]
 PICTURES = (
     "curves",
@@ -102,7 +104,7 @@ def test_another_store_is_refused_by_name(
     trained: Path,
     tiny_store: Callable[..., Path],
     tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
+    capsys: Said,
     store: dict[str, object],
     said: str,
 ) -> None:
@@ -121,7 +123,7 @@ def test_a_flipped_bit_is_refused_where_it_would_be_judged_on(
     tiny_store: Callable[..., Path],
     flip: Callable[[Path, str], Path],
     tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
+    capsys: Said,
 ) -> None:
     store = tiny_store(tmp_path, name="flipped")
     file = flip(store, "vl/features")
@@ -132,9 +134,7 @@ def test_a_flipped_bit_is_refused_where_it_would_be_judged_on(
     assert run("", evaluate.main, [*told, "--set", "evaluate.check_store=false"]) == 0
 
 
-def test_a_missing_checkpoint_says_what_to_run(
-    trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_missing_checkpoint_says_what_to_run(trained: Path, tmp_path: Path, capsys: Said) -> None:
     wanted = f"evaluate.checkpoint={tmp_path / 'nowhere'}"
     assert run("", evaluate.main, ["--params", str(trained), "--set", wanted]) == 2
     assert "Run stages.train_head" in capsys.readouterr().err
@@ -142,10 +142,7 @@ def test_a_missing_checkpoint_says_what_to_run(
 
 @pytest.mark.usefixtures("reports")
 def test_without_a_checkpoint_it_judges_what_train_head_wrote(
-    trained: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    trained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Said
 ) -> None:
     """And not an older head that lies where heads lie by default."""
     shutil.copytree(trained.parent / "head", tmp_path / "models/head")
@@ -160,10 +157,7 @@ def test_without_a_checkpoint_it_judges_what_train_head_wrote(
 
 @pytest.mark.usefixtures("reports")
 def test_a_policy_outlives_the_renaming_of_its_source(
-    trained: Path,
-    judged: tuple[Path, str],
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
+    trained: Path, judged: tuple[Path, str], tmp_path: Path, capsys: Said
 ) -> None:
     renamed = Path(shutil.copytree(trained.parent / "tiny.zarr", tmp_path / "renamed.zarr"))
     document = json.loads((renamed / "zarr.json").read_text())
@@ -269,7 +263,7 @@ def test_a_sampling_policy_is_judged_on_one_sample(trained: Path, tmp_path: Path
 
 @pytest.mark.usefixtures("reports")
 def test_more_steps_than_a_chunk_has_are_not_executed(
-    trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    trained: Path, tmp_path: Path, capsys: Said
 ) -> None:
     told = arguments(trained, tmp_path / "report", "evaluate.execute=9")
     assert run("", evaluate.main, told) == 2
@@ -298,7 +292,7 @@ def test_the_rollouts_of_this_policy_are_linked_though_they_come_later(
 
 @pytest.mark.parametrize("stage", [train_head, evaluate])
 def test_an_archive_has_to_be_restored_first(
-    stage: ModuleType, trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    stage: ModuleType, trained: Path, tmp_path: Path, capsys: Said
 ) -> None:
     packed = tmp_path / "tiny.archive.zarr"
     archive(trained.parent / "tiny.zarr", packed, level=1, threads=1)

@@ -15,6 +15,9 @@ from PIL import Image
 from stages import evaluate, extract, finetune, train_head
 from stages.command import run
 
+Said = pytest.CaptureFixture[str]
+Make = Callable[..., Any]
+
 Start = Callable[..., "subprocess.Popen[str]"]
 HELD = """
 import sys, time
@@ -93,7 +96,7 @@ def _write_episode(folder: Path, seed: int) -> None:
 
 
 @pytest.fixture
-def write_params(extracted: Path, tmp_path: Path) -> Callable[..., Path]:
+def write_params(extracted: Path, tmp_path: Path) -> Make:
     """`write_params(name, finetune={...}, ...)`: params that work below the test's folder."""
 
     def write(name: str = "tuned", **sections: dict[str, Any]) -> Path:
@@ -112,11 +115,11 @@ def write_params(extracted: Path, tmp_path: Path) -> Callable[..., Path]:
 
 
 def test_a_flipped_bit_is_refused_before_tuning(
-    write_params: Callable[..., Path],
+    write_params: Make,
     extracted: Path,
     flip: Callable[[Path, str], Path],
     tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
+    capsys: Said,
 ) -> None:
     store = extracted.parent / "made.zarr"
     file = flip(store, "tick/action")
@@ -129,10 +132,7 @@ def test_a_flipped_bit_is_refused_before_tuning(
 
 
 def test_it_tunes_and_says_how_to_go_on_and_that_works(
-    write_params: Callable[..., Path],
-    extracted: Path,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
+    write_params: Make, extracted: Path, tmp_path: Path, capsys: Said
 ) -> None:
     params, seed = str(write_params()), "train_head.seed=1"
     assert run("", finetune.main, ["--params", params, "--set", seed]) == 0
@@ -181,10 +181,7 @@ def test_it_tunes_and_says_how_to_go_on_and_that_works(
 
 @pytest.mark.slow
 def test_killed_in_mid_run_it_ends_where_an_undisturbed_run_ends(
-    started_until: Start,
-    write_params: Callable[..., Path],
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
+    started_until: Start, write_params: Make, tmp_path: Path, capsys: Said
 ) -> None:
     process = started_until(HELD, write_params("killed"), "holding")
     assert run("", finetune.main, ["--params", str(write_params("killed"))]) == 2
@@ -203,9 +200,7 @@ def test_killed_in_mid_run_it_ends_where_an_undisturbed_run_ends(
             assert one.read_bytes() == other.read_bytes()
 
 
-def test_mistakes_end_in_one_message(
-    write_params: Callable[..., Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_mistakes_end_in_one_message(write_params: Make, tmp_path: Path, capsys: Said) -> None:
     params = write_params()
     for override, said in (
         ("finetune.tuning.method=none", "python -m stages.train_head"),

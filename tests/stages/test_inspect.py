@@ -3,6 +3,7 @@
 import shutil
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,13 +17,14 @@ from stages import inspect
 from stages.command import run
 from tests.data.conftest import Truth, png, write_raw
 
+Said = pytest.CaptureFixture[str]
+Make = Callable[..., Any]
+
 PARAMS = Path(__file__).resolve().parents[2] / "params.yaml"
 
 
 @pytest.fixture
-def looked(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, demo_checkpoint: Path
-) -> Callable[..., int]:
+def looked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, demo_checkpoint: Path) -> Make:
     """`looked(*arguments)`: the exit code of the command, run in an empty folder."""
     monkeypatch.chdir(tmp_path)
     options = ["--params", str(PARAMS), "--set", f"vlm.checkpoint={demo_checkpoint}"]
@@ -35,10 +37,7 @@ def looked(
 
 
 def test_recordings_and_a_damaged_one_are_a_page(
-    looked: Callable[..., int],
-    recorded: Path,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
+    looked: Make, recorded: Path, tmp_path: Path, capsys: Said
 ) -> None:
     (episode,) = recorded.iterdir()
     for name in ("sound", "broken"):
@@ -59,7 +58,7 @@ def test_recordings_and_a_damaged_one_are_a_page(
 
 @pytest.mark.parametrize("version", [2, 3])
 def test_a_zarr_group_of_somebody_else_is_told_and_not_to_be_replaced(
-    looked: Callable[..., int], tmp_path: Path, capsys: pytest.CaptureFixture[str], version: int
+    looked: Make, tmp_path: Path, capsys: Said, version: int
 ) -> None:
     group = zarr.create_group(tmp_path / "umi.zarr", zarr_format=version)
     group.create_array("data/action", shape=(3,), dtype="f4")
@@ -71,10 +70,7 @@ def test_a_zarr_group_of_somebody_else_is_told_and_not_to_be_replaced(
 
 
 def test_a_korean_name_lacks_a_font_and_grey_frames_of_16_bits_are_not_white(
-    looked: Callable[..., int],
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
+    looked: Make, tmp_path: Path, capsys: Said, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Where a warning a letter came through, it would be an error here."""
     episode = write_raw(tmp_path / "바늘_삽입", Truth(), views=("View1",))
@@ -91,12 +87,7 @@ def test_a_korean_name_lacks_a_font_and_grey_frames_of_16_bits_are_not_white(
     assert page.count("fonts-noto-cjk") == 1 and "바늘_삽입" in page
 
 
-def test_a_store_is_a_page(
-    looked: Callable[..., int],
-    tiny_store: Callable[..., Path],
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_a_store_is_a_page(looked: Make, tiny_store: Make, tmp_path: Path, capsys: Said) -> None:
     store = tiny_store(tmp_path)
     assert looked(store, "--set", "inspect.output=mine") == 0
     assert "Store: tiny.zarr\nepisodes 6 · " in capsys.readouterr().out
@@ -113,12 +104,7 @@ def test_a_store_is_a_page(
     ],
 )
 def test_what_cannot_be_looked_at_is_refused(
-    looked: Callable[..., int],
-    tiny_store: Callable[..., Path],
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    place: str,
-    said: str,
+    looked: Make, tiny_store: Make, tmp_path: Path, capsys: Said, place: str, said: str
 ) -> None:
     from pipeline.store.archive import archive
 
@@ -167,7 +153,7 @@ def test_the_summary_says_one_place_and_what_was_found_there() -> None:
     ]
 
 
-def test_a_run_on_a_robot_is_a_recording(looked: Callable[..., int], tmp_path: Path) -> None:
+def test_a_run_on_a_robot_is_a_recording(looked: Make, tmp_path: Path) -> None:
     streams = {"action": {"names": ["a"], "units": ["mm"], "kind": "absolute"}, "views": []}
     spec = {"feature_spec": {"digest": "d"}, "feature_spec_digest": "d"}
     recorder = RunRecorder(tmp_path / "runs", {"streams": streams, "action_hz": 10.0} | spec, "Go")

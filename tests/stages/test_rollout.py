@@ -11,6 +11,8 @@ import yaml
 from stages import rollout, train_head
 from stages.command import run
 
+Said = pytest.CaptureFixture[str]
+
 
 def arguments(trained: Path, **changed: Any) -> list[str]:
     told = [f"rollout.{name}={value}" for name, value in changed.items()]
@@ -18,7 +20,7 @@ def arguments(trained: Path, **changed: Any) -> list[str]:
 
 
 def test_it_writes_metrics_table_and_page_the_same_every_time(
-    trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    trained: Path, tmp_path: Path, capsys: Said
 ) -> None:
     for output in ("first", "second"):
         told = arguments(trained, output=tmp_path / output, episodes=1)
@@ -44,7 +46,7 @@ def test_it_writes_metrics_table_and_page_the_same_every_time(
     ],
 )
 def test_what_cannot_be_run_is_refused_by_name(
-    trained: Path, capsys: pytest.CaptureFixture[str], changed: dict[str, Any], said: str
+    trained: Path, capsys: Said, changed: dict[str, Any], said: str
 ) -> None:
     assert run("", rollout.main, arguments(trained, **changed)) == 2
     error = capsys.readouterr().err
@@ -53,7 +55,7 @@ def test_what_cannot_be_run_is_refused_by_name(
 
 
 def test_another_model_than_the_policy_was_trained_on_is_refused(
-    trained: Path, capsys: pytest.CaptureFixture[str]
+    trained: Path, capsys: Said
 ) -> None:
     other = ["--set", "vlm.image_resize_width=112"]
     assert run("", rollout.main, [*arguments(trained), *other]) == 2
@@ -61,9 +63,7 @@ def test_another_model_than_the_policy_was_trained_on_is_refused(
 
 
 def test_a_policy_of_another_robot_is_refused(
-    quick_params: Callable[[Path], dict[str, Any]],
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
+    quick_params: Callable[[Path], dict[str, Any]], tmp_path: Path, capsys: Said
 ) -> None:
     path = tmp_path / "params.yaml"
     path.write_text(yaml.safe_dump(quick_params(tmp_path)))
@@ -79,7 +79,7 @@ def test_a_policy_of_another_robot_is_refused(
 
 
 def test_a_folder_of_somebody_else_is_left_alone(
-    trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    trained: Path, tmp_path: Path, capsys: Said
 ) -> None:
     (tmp_path / "thesis.txt").write_text("all of it")
     assert run("", rollout.main, arguments(trained, output=tmp_path)) == 2

@@ -14,6 +14,8 @@ from stages import store as stage
 from stages import train_head
 from stages.command import run
 
+Said = pytest.CaptureFixture[str]
+
 Make = Callable[..., Path]
 
 
@@ -52,7 +54,7 @@ def command(params: Path, *arguments: str) -> int:
 
 
 def test_list_names_what_was_trained_on_a_store(
-    params: Path, tiny_store: Make, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    params: Path, tiny_store: Make, tmp_path: Path, capsys: Said
 ) -> None:
     stores = tmp_path / "stores"
     tiny_store(stores, name="one")
@@ -85,7 +87,7 @@ def test_list_names_what_was_trained_on_a_store(
 
 
 def test_merge_gives_a_store_that_trains(
-    params: Path, tiny_store: Make, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    params: Path, tiny_store: Make, tmp_path: Path, capsys: Said
 ) -> None:
     a, b = (str(tiny_store(tmp_path, name=name, seed=seed)) for seed, name in enumerate("ab"))
     into = tmp_path / "stores" / "one.zarr"
@@ -99,7 +101,7 @@ def test_merge_gives_a_store_that_trains(
 
 
 def test_mistakes_end_in_one_message(
-    params: Path, tiny_store: Make, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    params: Path, tiny_store: Make, tmp_path: Path, capsys: Said
 ) -> None:
     a = str(tiny_store(tmp_path, name="a"))
     other = str(tiny_store(tmp_path, name="b", reuse=2))
@@ -121,7 +123,7 @@ def test_mistakes_end_in_one_message(
 
 
 def test_gc_lists_and_removes_only_when_told_to(
-    params: Path, tiny_store: Make, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    params: Path, tiny_store: Make, tmp_path: Path, capsys: Said
 ) -> None:
     stores = tmp_path / "stores"
     tiny_store(stores, name="one")
@@ -149,7 +151,7 @@ def test_gc_lists_and_removes_only_when_told_to(
 
 
 def test_without_a_word_it_lists_and_progress_is_silent(
-    params: Path, tiny_store: Make, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    params: Path, tiny_store: Make, tmp_path: Path, capsys: Said
 ) -> None:
     tiny_store(tmp_path / "stores", name="one")
     assert command(params) == 0

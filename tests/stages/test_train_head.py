@@ -17,6 +17,9 @@ from pipeline.store import build_lock
 from stages import train_head
 from stages.command import run
 
+Said = pytest.CaptureFixture[str]
+Make = Callable[..., Any]
+
 Start = Callable[..., "subprocess.Popen[str]"]
 WITHOUT_VLM = """
 import sys
@@ -74,8 +77,8 @@ LONGER = {
 
 @pytest.fixture
 def write_params(
-    tiny_store: Callable[..., Path], tiny_head: Callable[..., dict[str, Any]], tmp_path: Path
-) -> Callable[..., Path]:
+    tiny_store: Make, tiny_head: Callable[..., dict[str, Any]], tmp_path: Path
+) -> Make:
     """`write_params(train_head={...}, store={...})`: a params.yaml on a small store."""
 
     def write(name: str = "params", store: dict[str, Any] | None = None, **head: Any) -> Path:
@@ -101,9 +104,7 @@ def write_params(
 
 
 def test_a_logger_that_is_not_installed_is_named_before_the_store_is_opened(
-    write_params: Callable[..., Path],
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    write_params: Make, monkeypatch: pytest.MonkeyPatch, capsys: Said
 ) -> None:
     monkeypatch.setattr("pipeline.train.log._MODULES", {"wandb": "no_such_module"})
     path = write_params(loggers=["wandb"])
@@ -114,7 +115,7 @@ def test_a_logger_that_is_not_installed_is_named_before_the_store_is_opened(
 
 
 def test_it_trains_evaluates_and_then_has_nothing_to_do(
-    started: Start, write_params: Callable[..., Path], tmp_path: Path
+    started: Start, write_params: Make, tmp_path: Path
 ) -> None:
     """With neither transformers nor peft, and silent where there is no terminal."""
     params = write_params(
@@ -148,7 +149,7 @@ def test_it_trains_evaluates_and_then_has_nothing_to_do(
 
 
 def test_two_runs_do_not_write_their_curves_into_one_folder(
-    write_params: Callable[..., Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    write_params: Make, tmp_path: Path, capsys: Said
 ) -> None:
     params, logs = write_params(max_steps=2, store={"episodes": 3, "ticks": 12}), tmp_path / "logs"
     arguments = ["--params", str(params), "--set", f"train_head.logs={logs}"]
@@ -161,10 +162,7 @@ def test_two_runs_do_not_write_their_curves_into_one_folder(
 
 
 def test_killed_in_mid_run_it_ends_where_an_undisturbed_run_ends(
-    started_until: Start,
-    write_params: Callable[..., Path],
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
+    started_until: Start, write_params: Make, tmp_path: Path, capsys: Said
 ) -> None:
     undisturbed, killed = write_params("undisturbed"), write_params("killed")
     process = started_until(HELD.format(step=18), killed, "holding")
@@ -192,9 +190,7 @@ def test_killed_in_mid_run_it_ends_where_an_undisturbed_run_ends(
 
 @pytest.mark.slow
 def test_a_sigterm_leaves_the_step_it_came_in(
-    started_until: Start,
-    write_params: Callable[..., Path],
-    tmp_path: Path,
+    started_until: Start, write_params: Make, tmp_path: Path
 ) -> None:
     params = write_params(checkpoint_every=1000)
     process = started_until(HELD.format(step=6), params, "holding")
@@ -207,9 +203,7 @@ def test_a_sigterm_leaves_the_step_it_came_in(
     assert last["step"] == 7
 
 
-def test_mistakes_end_in_one_message(
-    write_params: Callable[..., Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_mistakes_end_in_one_message(write_params: Make, tmp_path: Path, capsys: Said) -> None:
     params = write_params()
     for override, said in (
         ("train_head.store=nowhere.zarr", "no finished store"),
@@ -225,11 +219,7 @@ def test_mistakes_end_in_one_message(
 
 @pytest.mark.parametrize("array", ["sensor/values", "vl/features"])
 def test_a_flipped_bit_is_refused_where_it_would_be_learnt_from(
-    write_params: Callable[..., Path],
-    flip: Callable[[Path, str], Path],
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    array: str,
+    write_params: Make, flip: Callable[[Path, str], Path], tmp_path: Path, capsys: Said, array: str
 ) -> None:
     arguments = ["--params", str(write_params(max_steps=3))]
     file = flip(tmp_path / "params.zarr", array)
@@ -247,10 +237,7 @@ def test_a_flipped_bit_is_refused_where_it_would_be_learnt_from(
 
 
 def test_features_of_another_store_are_refused_although_they_give_their_checksums(
-    write_params: Callable[..., Path],
-    tiny_store: Callable[..., Path],
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
+    write_params: Make, tiny_store: Make, tmp_path: Path, capsys: Said
 ) -> None:
     arguments = ["--params", str(write_params(max_steps=3))]
     store, other = tmp_path / "params.zarr", tiny_store(tmp_path, name="other", seed=9)

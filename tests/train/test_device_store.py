@@ -100,21 +100,11 @@ def test_device_takes_what_fits_the_smallest_first(
 
 
 def test_a_run_with_another_feed_continues_bit_for_bit(
-    store: FeatureStore, params: Make, trainer: Make, tmp_path: Path
+    store: FeatureStore, params: Make, trainer: Make, tmp_path: Path, stop_at: Make
 ) -> None:
     whole = trainer(store, params(feed="mapped", output=tmp_path / "whole"))
     whole.fit()
-    stopped = trainer(store, params(feed="mapped"))
-    real = stopped._save_last
-
-    def save_and_stop(*rest: Any) -> None:
-        real(*rest)
-        if stopped.step >= 10:
-            raise KeyboardInterrupt
-
-    stopped._save_last = save_and_stop
-    with pytest.raises(KeyboardInterrupt):
-        stopped.fit()
+    stop_at(trainer(store, params(feed="mapped")), 11)
     again = trainer(store, params(feed="device"))
     assert (again.run.status, again.step) == ("resumed", 10)
     again.fit()

@@ -152,7 +152,7 @@ def ranked(rank: int, port: int, said: Path, script: Path, *arguments: object) -
 
 
 @pytest.fixture
-def two_ranks(fork_server: ForkServerContext, tmp_path: Path) -> Callable[..., str]:
+def two_ranks(fork_server: ForkServerContext, tmp_path: Path) -> Make:
     """`two_ranks(script, ...)`: what the two processes have said, which must end well.
 
     Forked, and without torchrun, which imports for seconds and adds nothing to what they say to
@@ -236,7 +236,7 @@ def test_two_processes_follow_the_curve_of_one_that_accumulates(
     trainer: Make,
     write: Make,
     script: Path,
-    two_ranks: Callable[..., str],
+    two_ranks: Make,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -291,7 +291,7 @@ def test_a_signal_to_torchrun_stops_all_after_one_step_and_one_process_can_go_on
 
 
 def test_what_goes_wrong_is_said_once_and_nobody_waits(
-    write: Make, script: Path, two_ranks: Callable[..., str], tmp_path: Path
+    write: Make, script: Path, two_ranks: Make, tmp_path: Path
 ) -> None:
     """One case after the other between the same two processes, which must all end each."""
     cases = [
@@ -328,7 +328,7 @@ def test_a_process_that_fails_alone_ends_torchrun(write: Make, script: Path) -> 
     assert "Connection closed" not in err
 
 
-def test_what_processes_tell_each_other(two_ranks: Callable[..., str], tmp_path: Path) -> None:
+def test_what_processes_tell_each_other(two_ranks: Make, tmp_path: Path) -> None:
     script = tmp_path / "primitives.py"
     script.write_text(PRIMITIVES)
     said = two_ranks(script)

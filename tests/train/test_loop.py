@@ -26,12 +26,10 @@ from pipeline.train.predictions import predict
 from pipeline.train.run import TRAINER_VERSION
 from pipeline.train.scores import action_space, compare
 
+Patch = pytest.MonkeyPatch
+
 Make = Callable[..., Any]
 GOLDEN = Path(__file__).with_name("golden_run.json")
-
-
-class Stop(Exception):
-    """Stands for the end of the process."""
 
 
 def losses(trainer: Trainer) -> list[float]:
@@ -50,10 +48,7 @@ def same_weights(one: Trainer, other: Trainer) -> bool:
 
 @pytest.fixture(scope="module")
 def undisturbed(
-    store: FeatureStore,
-    params_below: Make,
-    trainer: Make,
-    tmp_path_factory: pytest.TempPathFactory,
+    store: FeatureStore, params_below: Make, trainer: Make, tmp_path_factory: pytest.TempPathFactory
 ) -> Trainer:
     """Twenty steps, finished; nothing of it is changed by a test."""
     done = trainer(store, params_below(tmp_path_factory.mktemp("whole")))
@@ -61,36 +56,20 @@ def undisturbed(
     return done
 
 
-@pytest.mark.parametrize("stopped", [1, 13, 20])
+@pytest.mark.parametrize("stopped", [1, 13, None])
 def test_killed_at_any_step_it_ends_the_same(
     store: FeatureStore,
     params: Make,
     trainer: Make,
     undisturbed: Trainer,
-    monkeypatch: pytest.MonkeyPatch,
-    stopped: int,
+    stop_at: Make,
+    stopped: int | None,
 ) -> None:
-    real = Trainer._train_step
-
-    def killed(self: Trainer, *rest: Any) -> bool:
-        if self.step == stopped:
-            raise Stop
-        return real(self, *rest)
-
-    def killed_at_the_end(self: Trainer, *rest: object) -> None:
-        raise Stop
-
-    with monkeypatch.context() as patched:
-        if stopped == 20:
-            patched.setattr("pipeline.train.run.TrainingRun.finish", killed_at_the_end)
-        else:
-            patched.setattr(Trainer, "_train_step", killed)
-        with pytest.raises(Stop):
-            trainer(store, params()).fit()
+    stop_at(trainer(store, params()), stopped)
     # What decides no number may change between the two starts.
     resumed = trainer(store, params(checkpoint_every=7))
-    assert resumed.run.status == ("resumed" if stopped >= 5 else "new")
-    assert resumed.step == stopped - stopped % 5
+    assert resumed.run.status == ("new" if stopped == 1 else "resumed")
+    assert resumed.step == {1: 0, 13: 10, None: 20}[stopped]
     resumed.fit()
     assert losses(resumed) == losses(undisturbed)
     assert same_weights(resumed, undisturbed)
@@ -102,11 +81,7 @@ def test_killed_at_any_step_it_ends_the_same(
 
 
 def test_a_signal_ends_the_step_and_saves_once(
-    store: FeatureStore,
-    params: Make,
-    trainer: Make,
-    undisturbed: Trainer,
-    monkeypatch: pytest.MonkeyPatch,
+    store: FeatureStore, params: Make, trainer: Make, undisturbed: Trainer, monkeypatch: Patch
 ) -> None:
     real, save = Trainer._train_step, Trainer._save_last
     saved: list[int] = []
@@ -145,6 +120,10 @@ def test_what_a_finished_run_leaves(undisturbed: Trainer, store: FeatureStore) -
     assert best.metrics["val/error"] == undisturbed.stopping.best_error
     for name, value in undisturbed.averaged.state_dict().items():
         assert torch.equal(last.weights[name], value)
+    held = dict(undisturbed.averaged.named_buffers())
+    assert held
+    for name, value in undisturbed.policy.named_buffers():
+        assert torch.equal(value, held[name]), name
     with (logs / "plots/metrics/val/error.tsv").open() as file:
         curve = {
             int(row["step"]): float(row["error"]) for row in csv.DictReader(file, delimiter="\t")
@@ -220,7 +199,7 @@ def test_any_stream_may_be_left_out(store: FeatureStore, params: Make, trainer: 
 
 
 def test_a_loss_that_is_not_finite_names_step_and_ticks(
-    store: FeatureStore, params: Make, trainer: Make, monkeypatch: pytest.MonkeyPatch
+    store: FeatureStore, params: Make, trainer: Make, monkeypatch: Patch
 ) -> None:
     stopped = trainer(store, params())
     real = stopped.policy.loss
@@ -238,11 +217,7 @@ def test_a_loss_that_is_not_finite_names_step_and_ticks(
 
 
 def test_logs_need_no_repository_and_change_none(
-    store: FeatureStore,
-    params: Make,
-    trainer: Make,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
+    store: FeatureStore, params: Make, trainer: Make, tmp_path: Path, monkeypatch: Patch
 ) -> None:
     """A repository without a commit, which dvclive itself cannot bear."""
     subprocess.run(["git", "init", "-q", str(tmp_path)], check=True)
@@ -290,13 +265,6 @@ def test_autocast_trains_in_bfloat16(store: FeatureStore, params: Make, trainer:
     assert all(value.dtype == torch.float32 for value in done.policy.state_dict().values())
 
 
-def test_the_average_shares_what_never_changes(undisturbed: Trainer) -> None:
-    held = dict(undisturbed.averaged.named_buffers())
-    assert held
-    for name, value in undisturbed.policy.named_buffers():
-        assert torch.equal(value, held[name]), name
-
-
 def test_logs_stay_known_where_no_speed_lies_beside_them(
     store: FeatureStore, params: Make, trainer: Make
 ) -> None:
@@ -329,19 +297,9 @@ def test_logs_never_write_through_a_link(
 
 @pytest.mark.gpu
 def test_on_a_gpu_a_run_is_stopped_resumed_and_judged(
-    store: FeatureStore, params: Make, trainer: Make, monkeypatch: pytest.MonkeyPatch
+    store: FeatureStore, params: Make, trainer: Make, stop_at: Make
 ) -> None:
-    real = Trainer._train_step
-
-    def killed(self: Trainer, *rest: Any) -> bool:
-        if self.step == 12:
-            raise Stop
-        return real(self, *rest)
-
-    with monkeypatch.context() as patched:
-        patched.setattr(Trainer, "_train_step", killed)
-        with pytest.raises(Stop):
-            trainer(store, params(device="cuda")).fit()
+    stop_at(trainer(store, params(device="cuda")), 12)
     resumed = trainer(store, params(device="cuda"))
     assert (resumed.run.status, resumed.step, resumed.device.type) == ("resumed", 10, "cuda")
     resumed.fit()

@@ -73,10 +73,7 @@ def test_every_step_can_be_gone_on_from(
 
 @pytest.fixture(scope="module")
 def of_two_parts(
-    store: FeatureStore,
-    params_below: Make,
-    trainer: Make,
-    tmp_path_factory: pytest.TempPathFactory,
+    store: FeatureStore, params_below: Make, trainer: Make, tmp_path_factory: pytest.TempPathFactory
 ) -> Path:
     """A finished run of two parts a step, to be copied."""
     chosen = params_below(tmp_path_factory.mktemp("parts"), grad_accumulation=2, max_steps=2)

@@ -185,12 +185,7 @@ class TestSides:
     )
     @settings(deadline=None)
     def test_whole_groups_fall_on_one_side_each(
-        self,
-        lengths: list[int],
-        shares: tuple[float, float],
-        seed: int,
-        sources: int,
-        paired: bool,
+        self, lengths: list[int], shares: tuple[float, float], seed: int, sources: int, paired: bool
     ) -> None:
         """And each source of three or more has one on each side asked for, one of two trains."""
         keys = [i // 2 for i in range(len(lengths))] if paired else None
