@@ -7,13 +7,12 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 import yaml
-from PIL import Image
 
 from stages import evaluate, extract, finetune, train_head
 from stages.command import run
+from tests.train.finetuning.conftest import write_episode
 
 Said = pytest.CaptureFixture[str]
 Make = Callable[..., Any]
@@ -44,7 +43,7 @@ def extracted(tmp_path_factory: pytest.TempPathFactory, demo_checkpoint: Path) -
     """A params.yaml whose store of three recordings is finished."""
     root = tmp_path_factory.mktemp("finetune_stage")
     for seed in range(3):
-        _write_episode(root / "recordings" / "Touch_dot" / f"episode_{seed}", seed)
+        write_episode(root / "recordings" / "Touch_dot" / f"episode_{seed}", seed, ("View1",))
     document = {
         "data": {"root": str(root / "recordings"), "sources": [{"name": "made", "path": "."}]},
         "vlm": {
@@ -70,29 +69,6 @@ def extracted(tmp_path_factory: pytest.TempPathFactory, demo_checkpoint: Path) -
     path.write_text(yaml.safe_dump(document))
     assert run("", extract.main, ["--params", str(path)]) == 0
     return path
-
-
-def _write_episode(folder: Path, seed: int) -> None:
-    """Two seconds of one camera and of poses, in the windowed format."""
-    rng = np.random.default_rng(seed)
-    start = 1.7e9 + 10 * seed
-    (folder / "images" / "View1").mkdir(parents=True)
-    for frame in range(21):
-        pixels = rng.integers(0, 255, (24, 32, 3), np.uint8)
-        name = f"{start + frame / 10:.3f}.jpg"
-        Image.fromarray(pixels).save(folder / "images" / "View1" / name)
-    poses = np.cumsum(rng.normal(size=(201, 12)), axis=0).astype(np.float32) * 0.1
-    np.savez(
-        folder / "robot_states.npz", robot_states=poses, joints=poses[:, :6], poses=poses[:, 6:]
-    )
-    metadata = {
-        "episode_name": folder.name,
-        "start_time": start,
-        "end_time": start + 2.0,
-        "camera_views": ["View1"],
-        "robot_hz": 100,
-    }
-    (folder / "metadata.json").write_text(json.dumps(metadata))
 
 
 @pytest.fixture

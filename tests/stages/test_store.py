@@ -4,6 +4,7 @@ import os
 import subprocess
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 import yaml
@@ -20,20 +21,9 @@ Make = Callable[..., Path]
 
 
 @pytest.fixture
-def params(tmp_path: Path) -> Path:
+def params(tiny_head: Callable[..., dict[str, Any]], tmp_path: Path) -> Path:
     (tmp_path / "stores").mkdir()
-    small = {
-        "sensor_encoder": {"channels": [4], "layers": 0, "heads": 1, "output_dim": 4},
-        "state_encoder": {"dim": 4, "layers": 0, "heads": 1, "output_dim": 4},
-        "expert": {"dim": 4, "layers": 1, "heads": 1},
-        "horizon": 2,
-        "sensor_window": 3,
-        "state_window": 3,
-        "max_steps": 2,
-        "device": "cpu",
-        "output": str(tmp_path / "models" / "head"),
-        "logs": str(tmp_path / "logs"),
-    }
+    small = tiny_head(tmp_path, output=str(tmp_path / "models" / "head"), horizon=2, max_steps=2)
     document = {
         "data": {"sources": [{"name": "left", "path": "a"}, {"name": "right", "path": "b"}]},
         "vlm": {"checkpoint": "unused"},

@@ -172,10 +172,6 @@ class TestCheckpoint:
         assert verified("--checkpoint", str(tmp_path / "head")) == 2
         assert capsys.readouterr().err.startswith("error: 2 of 2 golden rows are not")
 
-    def test_no_checkpoint_there(self, verified, tmp_path, capsys):
-        assert verified("--checkpoint", str(tmp_path / "none")) == 2
-        assert "expected a checkpoint" in capsys.readouterr().err
-
 
 def test_a_damaged_golden_row_is_named_and_repaired(verified, tiny_golden, tmp_path, capsys):
     store = tiny_golden(tmp_path, name="golden")

@@ -136,9 +136,9 @@ def test_what_is_kept_is_the_averaged_model_that_was_judged(params: Make, tmp_pa
 def test_a_run_goes_on_from_any_checkpoint_to_the_same_bits(
     params: Make, tmp_path: Path, stop_at: Make
 ) -> None:
-    whole = trainer(params(finetune={"output": str(tmp_path / "whole")}))
+    whole = trainer(params(finetune={"output": str(tmp_path / "whole"), "max_steps": 4}))
     whole.fit()
-    given = params(finetune={"output": str(tmp_path / "stopped")})
+    given = params(finetune={"output": str(tmp_path / "stopped"), "max_steps": 4})
     stop_at(trainer(given), 3)
     resumed = trainer(given)
     assert (resumed.run.status, resumed.step) == ("resumed", 2)
