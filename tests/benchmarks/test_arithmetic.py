@@ -2,17 +2,15 @@
 
 from pathlib import Path
 
-import pytest
-
 from benchmarks import arithmetic
 from benchmarks.arithmetic import page, row_cost, store_arrays
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "speed.md"
 
 
-@pytest.mark.parametrize("table", page().split("\n\n"), ids=lambda table: table.split("\n")[0])
-def test_the_page_has_each_table_as_it_is_computed(table):
-    assert table in PAGE.read_text(encoding="utf-8")
+def test_the_page_has_each_table_as_it_is_computed():
+    written = PAGE.read_text(encoding="utf-8")
+    assert [table for table in page().split("\n\n") if table not in written] == []
 
 
 def test_bytes_follow_the_formulas_of_the_page():

@@ -44,7 +44,7 @@ def counted(model: Any, image_size: tuple[int, int], images: int, text_tokens: i
 
 @pytest.mark.parametrize(
     ("image_size", "images"),
-    [((112, 168), 3), ((140, 252), 1), ((364, 644), 2), ((56, 56), 2)],
+    [((112, 168), 3), ((140, 252), 1), ((56, 56), 2)],
 )
 def test_a_row_costs_what_torch_counts(demo_model, image_size, images):
     expected = counted(demo_model, image_size, images, text_tokens=50)
@@ -91,18 +91,11 @@ def test_the_shell_is_a_checkpoint_folder_of_the_real_shape(tmp_path):
     assert read.image_token_id == config.image_token_id < 1600
 
 
-@pytest.mark.parametrize(
-    ("name", "tera"),
-    [
+def test_peaks_by_name():
+    for name, tera in (
         ("NVIDIA A100-SXM4-80GB", 312),
         ("NVIDIA H100 80GB HBM3", 989),
         ("NVIDIA H100 PCIe", 756),
-        ("NVIDIA GeForce RTX 4090", 165),
-    ],
-)
-def test_peaks_by_name(name, tera):
-    assert peak_flops(name) == tera * 1e12
-
-
-def test_an_unknown_device_has_no_peak():
+    ):
+        assert peak_flops(name) == tera * 1e12
     assert peak_flops("NVIDIA GeForce GTX 1080") is None

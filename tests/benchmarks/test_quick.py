@@ -32,7 +32,16 @@ def assert_is_a_report(out: str, name: str) -> None:
         assert {"what", "found", "wanted", "reached"} <= set(target)
 
 
-@pytest.mark.parametrize("name", sorted(BENCHMARKS - {ALONE}))
+SLOW = {"extract", "head_latency", "reading", "robot_jitter"}
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=[pytest.mark.slow] if name in SLOW else [])
+        for name in sorted(BENCHMARKS - {ALONE})
+    ],
+)
 def test_a_quick_run_prints_one_line_of_json(name, tmp_path, monkeypatch, capfd):
     monkeypatch.chdir(ROOT)
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
@@ -44,6 +53,7 @@ def test_a_quick_run_prints_one_line_of_json(name, tmp_path, monkeypatch, capfd)
     assert not list(tmp_path.iterdir()), "it cleans up"
 
 
+@pytest.mark.slow
 @pytest.mark.extra
 def test_the_command_that_a_report_names_is_that_of_its_run(tmp_path):
     for contender in ("h5py", "lmdb", "tensorstore"):

@@ -54,7 +54,6 @@ class TestShares:
         ("weights", "batch_size", "said"),
         [
             ({"old": -1.0}, 7, r"weights \{'old': -1\.0\}"),
-            ({"old": float("nan")}, 7, "finite"),
             ({"older": 1.0}, 7, r"items \{'old': 3, 'new': 6\}, weights \{'older'"),
             ({}, 0, "batch_size from 1.*found batch_size 0"),
         ],
@@ -114,10 +113,6 @@ class TestLoader:
                 items = batches.batch(epoch * steps)
                 assert batch.tick.tolist() == loader.dataset.ticks[items].tolist()
 
-    def test_a_negative_weight_is_refused(self, extracted: FeatureStore) -> None:
-        with pytest.raises(ConfigError, match=r"weights .*'new': -3"):
-            create_unified_dataloader(store=extracted, new_weight=-3.0)
-
     def test_draws_old_and_new_recordings_1_to_3(self, loader: Any) -> None:
         formats = [one.format for one in loader.dataset.store.episodes]
         for _, batch in zip(range(4), loader, strict=False):
@@ -135,12 +130,6 @@ class TestLoader:
         items = loader.batch_sampler.batch(0)
         assert torch.equal(batch.action, loader.dataset.__getitems__(items).action)
         assert batch.features.shape[1:] == extracted.feature_shape
-
-    def test_a_store_alone_is_old_and_new_by_format(self, extracted: FeatureStore) -> None:
-        loader = create_unified_dataloader(store=extracted, batch_size=8)
-        batch = next(iter(loader))
-        formats = [extracted.episodes[index].format for index in batch.episode.tolist()]
-        assert formats.count("old") == 2
 
     def test_formats_without_a_weight_are_refused(self, tiny_store: Any, tmp_path: Path) -> None:
         path = tiny_store(tmp_path)

@@ -37,6 +37,8 @@ from pipeline.vlm.live import LiveVLM, live_spec
 from pipeline.vlm.preparation import Preparer
 from pipeline.vlm.qwen import FrozenVLM
 
+Make = Callable[..., Any]
+
 VIEWS = ("View1", "View2")
 TEXT = ["insert the needle", "stop", "insert the needle", "retract"]
 SMALL: dict[str, Any] = {
@@ -66,7 +68,7 @@ def small_policy(shape: PolicyShape) -> Policy:
 
 
 @pytest.fixture
-def build(demo_checkpoint: Path) -> Callable[..., QwenVLAUnified]:
+def build(demo_checkpoint: Path) -> Make:
     """`build(**arguments)`: a small unified model on the demo's checkpoint, from a fixed seed."""
 
     def make(kind: type[QwenVLAUnified] = QwenVLAUnified, **arguments: Any) -> QwenVLAUnified:
@@ -104,12 +106,9 @@ def _cached(
     return features.to(getattr(torch, dtype)), valid
 
 
-@pytest.mark.parametrize("model_type", ["regression", "diffusion", "flow_matching"])
+@pytest.mark.parametrize("model_type", ["regression", "flow_matching"])
 def test_live_cached_and_mixed_give_the_same_chunk(
-    build: Callable[..., QwenVLAUnified],
-    images: list[Any],
-    streams: dict[str, Tensor],
-    model_type: str,
+    build: Make, images: list[Any], streams: dict[str, Tensor], model_type: str
 ) -> None:
     model = build(model_type=model_type)
     features, slot_valid = _cached(model, images)
@@ -135,7 +134,7 @@ def test_live_cached_and_mixed_give_the_same_chunk(
 
 
 def test_bfloat16_live_and_cached_agree_within_its_noise(
-    build: Callable[..., QwenVLAUnified], images: list[Any], streams: dict[str, Tensor]
+    build: Make, images: list[Any], streams: dict[str, Tensor]
 ) -> None:
     model = build(model_type="regression", vlm={"dtype": "bfloat16"})
     features, slot_valid = _cached(model, images, "bfloat16")
@@ -144,7 +143,7 @@ def test_bfloat16_live_and_cached_agree_within_its_noise(
     assert ((live - cached).norm() / cached.norm()) < 0.03
 
 
-def test_equal_samples_share_a_row(build: Callable[..., QwenVLAUnified], images: list[Any]) -> None:
+def test_equal_samples_share_a_row(build: Make, images: list[Any]) -> None:
     model = build()
     observation = model.observe(images, TEXT)
     assert isinstance(observation, LiveObservation)
@@ -160,9 +159,7 @@ def test_equal_samples_share_a_row(build: Callable[..., QwenVLAUnified], images:
     assert batches == [3]
 
 
-def test_what_is_not_given_is_missing(
-    build: Callable[..., QwenVLAUnified], streams: dict[str, Tensor]
-) -> None:
+def test_what_is_not_given_is_missing(build: Make, streams: dict[str, Tensor]) -> None:
     model = build()
     observation = model.observe(sensor=streams["sensor"])
     assert not observation.slot_valid.any()
@@ -172,48 +169,32 @@ def test_what_is_not_given_is_missing(
 
 
 def test_a_stream_without_an_encoder_is_not_looked_at(
-    build: Callable[..., QwenVLAUnified], streams: dict[str, Tensor]
+    build: Make, streams: dict[str, Tensor]
 ) -> None:
     model = build(model_type="regression", sensor_enabled=False)
     torch.testing.assert_close(model(**streams), model(state=streams["state"]))
     assert model(sensor=torch.randn(3, 2), state=streams["state"]).shape == (4, 8, 7)
 
 
-@pytest.mark.parametrize("name", ["sensr", "sensor_vaild", "action_vaild"])
-def test_a_misspelt_argument_is_refused(
-    build: Callable[..., QwenVLAUnified], streams: dict[str, Tensor], name: str
-) -> None:
+def test_a_misspelt_argument_is_refused(build: Make, streams: dict[str, Tensor]) -> None:
     model = build()
     for door in (model, model.observe):
-        with pytest.raises(TypeError, match=name):
-            door(**streams, **{name: torch.ones(4)})
+        with pytest.raises(TypeError, match="sensor_vaild"):
+            door(**streams, sensor_vaild=torch.ones(4))
 
 
-@pytest.mark.parametrize(
-    "given",
-    [
-        {},
-        {"images": [None, None]},
-        {"images": []},
-        {"text": TEXT},
-        {"feature_age": torch.rand(4)},
-        {"actions": torch.randn(4, 8, 7)},
-    ],
-)
-def test_nothing_to_look_at_is_refused(
-    build: Callable[..., QwenVLAUnified], given: dict[str, Any]
-) -> None:
-    with pytest.raises(ObservationError, match="images or at least one of features, sensor, state"):
-        build()(**given)
-    with pytest.raises(
-        ObservationError, match="images or at least one of features, state, found none"
-    ):
-        build(sensor_enabled=False)(sensor=torch.randn(4, 13, 9))
+def test_nothing_to_look_at_is_refused(build: Make) -> None:
+    model, blind = build(), build(sensor_enabled=False)
+    for given in ({"images": [None, None]}, {"text": TEXT}, {"actions": torch.randn(4, 8, 7)}):
+        with pytest.raises(ObservationError, match="at least one of features, sensor, state"):
+            model(**given)
+    with pytest.raises(ObservationError, match="at least one of features, state, found none"):
+        blind(sensor=torch.randn(4, 13, 9))
 
 
-@pytest.mark.parametrize("to", [torch.Tensor.numpy, torch.Tensor.tolist, torch.Tensor.clone])
+@pytest.mark.parametrize("to", [torch.Tensor.numpy, torch.Tensor.tolist])
 def test_validity_is_taken_as_a_store_has_it(
-    build: Callable[..., QwenVLAUnified], streams: dict[str, Tensor], to: Callable[[Tensor], Any]
+    build: Make, streams: dict[str, Tensor], to: Callable[[Tensor], Any]
 ) -> None:
     model = build(model_type="regression")
     features = torch.randn(4, 3, 128)
@@ -233,46 +214,27 @@ def test_validity_is_taken_as_a_store_has_it(
     assert torch.equal(*losses)
 
 
-@pytest.mark.parametrize(
-    ("given", "message"),
-    [
-        ({"features": (4, 3, 100)}, r"features: .*\(batch 4, slot 3, dim 128\), found \(4, 3, 100"),
-        ({"features": (4, 5, 128)}, r"features: .*slot 3, .* found \(4, 5, 128\)"),
+def test_a_shape_that_does_not_fit_is_named(build: Make, streams: dict[str, Tensor]) -> None:
+    model = build()
+    for given, message in (
+        ({"features": (4, 3, 100)}, r"features: .*slot 3, dim 128\), found \(4, 3, 100"),
         ({"features": (3, 3, 128)}, r"sensor: .*batch 3, .* found \(4, 13, 9\).* that of features"),
-        (
-            {"features": (4, 3, 128), "slot_valid": (4, 2)},
-            r"slot_valid: .*slot 3\), found \(4, 2\)",
-        ),
-        ({"feature_age": (4, 1)}, r"feature_age: .*\(batch 4\), found \(4, 1\)"),
-        ({"sensor": (4, 13, 8)}, r"sensor: .*window any, channel 9\), found \(4, 13, 8\)"),
+        ({"features": (4, 3, 128), "slot_valid": (4, 2)}, r"slot_valid: .*found \(4, 2\)"),
         ({"sensor": (4, 0, 9)}, r"sensor: .*window any, .* found \(4, 0, 9\)"),
         ({"sensor": ()}, r"sensor: .* found \(\)"),
         ({"sensor_valid": (4, 13)}, r"sensor_valid: .*\(batch 4\), found \(4, 13\)"),
-        ({"state": (4, 20, 11)}, r"state: .*window any, channel 12\), found \(4, 20, 11\)"),
-        ({"state_age": (4, 20)}, r"state_age: .*window 25\), found \(4, 20\)"),
         ({"state": (5, 25, 12)}, r"state: .*batch 4, .* found \(5, .*that of sensor"),
-        ({"state_valid": (2,)}, r"state_valid: .*\(batch 4\), found \(2,\)"),
+        ({"state_age": (4, 20)}, r"state_age: .*window 25\), found \(4, 20\)"),
         ({"actions": (4, 9, 7)}, r"actions: .*horizon 8, channel 7\), found \(4, 9, 7\)"),
-        ({"actions": (3, 8, 7)}, r"actions: .*batch 4, .* found \(3, 8, 7\)"),
-        (
-            {"actions": (4, 8, 7), "action_valid": (4, 7)},
-            r"action_valid: .*\(batch 4, horizon 8\), found \(4, 7\)",
-        ),
+        ({"actions": (4, 8, 7), "action_valid": (4, 7)}, r"action_valid: .*found \(4, 7\)"),
         ({"slot_valid": (4, 3)}, "slot_valid: expected features beside it"),
-    ],
-)
-def test_a_shape_that_does_not_fit_is_named(
-    build: Callable[..., QwenVLAUnified],
-    streams: dict[str, Tensor],
-    given: dict[str, tuple[int, ...]],
-    message: str,
-) -> None:
-    with pytest.raises(ObservationError, match=message):
-        build()(**(streams | {name: torch.ones(size) for name, size in given.items()}))
+    ):
+        with pytest.raises(ObservationError, match=message):
+            model(**(streams | {name: torch.ones(size) for name, size in given.items()}))
 
 
 def test_images_text_and_streams_are_of_one_batch(
-    build: Callable[..., QwenVLAUnified], images: list[Any], streams: dict[str, Tensor]
+    build: Make, images: list[Any], streams: dict[str, Tensor]
 ) -> None:
     model = build()
     for text in (None, TEXT[:3], "stop"):
@@ -283,12 +245,9 @@ def test_images_text_and_streams_are_of_one_batch(
             model(some, TEXT[:3], **streams)
 
 
-@pytest.mark.parametrize("model_type", ["regression", "diffusion", "flow_matching"])
+@pytest.mark.parametrize("model_type", ["diffusion"])
 def test_a_fresh_model_acts_without_dropout(
-    build: Callable[..., QwenVLAUnified],
-    images: list[Any],
-    streams: dict[str, Tensor],
-    model_type: str,
+    build: Make, images: list[Any], streams: dict[str, Tensor], model_type: str
 ) -> None:
     over: dict[str, Any] = {"expert": SMALL["expert"] | {"dropout": 0.5}, "drop_sensor": 0.5}
     model = build(model_type=model_type, finetune_vl="lora", **over).train()
@@ -316,7 +275,7 @@ def test_a_fresh_model_acts_without_dropout(
 
 
 def test_it_is_trainable_and_gives_the_loss_where_actions_are_given(
-    build: Callable[..., QwenVLAUnified], images: list[Any], streams: dict[str, Tensor]
+    build: Make, images: list[Any], streams: dict[str, Tensor]
 ) -> None:
     model = build(model_type="diffusion")
     assert isinstance(model, Trainable)
@@ -346,9 +305,7 @@ def _generator() -> torch.Generator:
 
 
 @pytest.mark.parametrize("finetune_vl", ["lora", "full"])
-def test_tuning_lowers_the_loss(
-    build: Callable[..., QwenVLAUnified], images: list[Any], finetune_vl: str
-) -> None:
+def test_tuning_lowers_the_loss(build: Make, images: list[Any], finetune_vl: str) -> None:
     model = build(model_type="regression", finetune_vl=finetune_vl, lora_dropout=0.0).train()
     # Only the vision-language model learns, and an optimizer sees it without asking for it.
     model.policy.requires_grad_(False)
@@ -369,9 +326,9 @@ def test_tuning_lowers_the_loss(
     assert losses[-1] < 0.98 * losses[0], losses
 
 
-@pytest.mark.parametrize("finetune_vl", ["none", "lora", "full"])
+@pytest.mark.parametrize("finetune_vl", ["none", "lora"])
 def test_a_state_dict_restores_it_in_a_fresh_model(
-    build: Callable[..., QwenVLAUnified], images: list[Any], finetune_vl: str
+    build: Make, images: list[Any], finetune_vl: str
 ) -> None:
     """Whether or not the model in front was loaded when it was saved, and when it is restored."""
     saved = build(model_type="regression", finetune_vl=finetune_vl)
@@ -384,19 +341,12 @@ def test_a_state_dict_restores_it_in_a_fresh_model(
     torch.testing.assert_close(restored(images, TEXT), chunk)
     restored.load_state_dict(saved.state_dict())
     torch.testing.assert_close(restored(images, TEXT), chunk)
+    torch.testing.assert_close(pickle.loads(pickle.dumps(restored))(images, TEXT), chunk)
     with pytest.raises(RuntimeError, match=r"policy\.expert"):
         restored.load_state_dict({})
 
 
-def test_a_model_in_use_can_be_pickled(
-    build: Callable[..., QwenVLAUnified], images: list[Any]
-) -> None:
-    model = build(model_type="regression")
-    chunk = model(images, TEXT)
-    torch.testing.assert_close(pickle.loads(pickle.dumps(model))(images, TEXT), chunk)
-
-
-def test_of_two_parts(build: Callable[..., QwenVLAUnified], images: list[Any]) -> None:
+def test_of_two_parts(build: Make, images: list[Any]) -> None:
     whole = build(finetune_vl="lora")
     vlm = whole.load_vlm()
     model = QwenVLAUnified.of(whole.policy, vlm).eval()
@@ -459,20 +409,14 @@ def _live(vlm: VLMParams, views: Sequence[str] = VIEWS) -> LiveVLM:
     ("live", "views", "said"),
     [
         ({}, ("View1", "View3"), r'views: \["View1", "View2"\] -> \["View1", "View3"\]'),
-        ({}, ("View1",), "slots: 3 entries -> 2 entries"),
         ({"image_resize_width": 56}, VIEWS, r"processor.image_size: \[56, 84\] -> \[56, 56\]"),
         ({"prompt": "{images} {instruction}"}, VIEWS, 'prompt: .* -> "{images} {instruction}"'),
         ({"layers": (0,)}, VIEWS, r"slots\[0\].layer: 3 -> 0"),
-        ({"pooling": ("last", "view_mean")}, VIEWS, 'slots.*: "mean" -> "last"'),
         ({"dtype": "bfloat16"}, VIEWS, 'compute_dtype: "float32" -> "bfloat16"'),
     ],
 )
 def test_a_live_model_of_other_features_than_the_policy_s_is_refused(
-    trained: Callable[..., Policy],
-    demo_checkpoint: Path,
-    live: dict[str, Any],
-    views: tuple[str, ...],
-    said: str,
+    trained: Make, demo_checkpoint: Path, live: dict[str, Any], views: tuple[str, ...], said: str
 ) -> None:
     vlm = SEEN.model_copy(update={"checkpoint": str(demo_checkpoint), **live})
     with pytest.raises(CheckpointMismatch, match=said):
@@ -480,7 +424,7 @@ def test_a_live_model_of_other_features_than_the_policy_s_is_refused(
 
 
 def test_a_live_model_of_other_weights_is_refused(
-    trained: Callable[..., Policy], demo_checkpoint: Path, tmp_path: Path
+    trained: Make, demo_checkpoint: Path, tmp_path: Path
 ) -> None:
     other = shutil.copytree(demo_checkpoint, tmp_path / "other")
     vlm = SEEN.model_copy(update={"checkpoint": str(other)})
@@ -495,29 +439,13 @@ def test_a_live_model_of_other_weights_is_refused(
     assert len(str(refused.value).splitlines()) == 3, "nothing else differs"
 
 
-@pytest.mark.parametrize("variants", [1, 2])
-@pytest.mark.parametrize("storage_dtype", ["float32", "float16", "bfloat16"])
+@pytest.mark.parametrize(("storage_dtype", "variants"), [("float16", 1), ("bfloat16", 2)])
 def test_how_features_were_stored_makes_no_live_ones_others(
-    trained: Callable[..., Policy], demo_checkpoint: Path, storage_dtype: str, variants: int
+    trained: Make, demo_checkpoint: Path, storage_dtype: str, variants: int
 ) -> None:
     vlm = SEEN.model_copy(update={"checkpoint": str(demo_checkpoint)})
     policy = trained(storage_dtype, variants=variants)
     assert QwenVLAUnified.of(policy, _live(vlm)).policy is policy
-
-
-def test_a_live_model_of_a_store_spec_is_the_one_built_by_name(
-    build: Callable[..., QwenVLAUnified], demo_checkpoint: Path
-) -> None:
-    vlm = VLMParams(
-        checkpoint=str(demo_checkpoint),
-        dtype="float32",
-        image_resize_height=56,
-        image_resize_width=84,
-        pooling=("mean", "view_mean"),
-    )
-    spec = live_spec(vlm, VIEWS)
-    live = LiveVLM.load(vlm, spec, TuningParams(method="none"), "cpu")
-    assert build().load_vlm().spec.digest == live.spec.digest
 
 
 def test_the_arguments_it_has_always_had() -> None:
@@ -545,7 +473,7 @@ def test_the_arguments_it_has_always_had() -> None:
 
 
 def test_a_part_that_is_named_in_part_keeps_the_rest_of_it(
-    build: Callable[..., QwenVLAUnified],
+    build: Make,
 ) -> None:
     params = build(expert={"dim": 32, "heads": 2}, state_encoder={"dim": 16}).policy.params
     assert (params.expert.dim, params.expert.heads, params.expert.layers) == (32, 2, 4)
@@ -554,14 +482,10 @@ def test_a_part_that_is_named_in_part_keeps_the_rest_of_it(
         build(expert=None)
 
 
-@pytest.mark.parametrize("fusion", ["concat", "cross_attention", "gated", "none"])
-def test_every_fusion(
-    build: Callable[..., QwenVLAUnified], streams: dict[str, Tensor], fusion: str
-) -> None:
-    model = build(fusion_strategy=fusion)
-    assert model(features=torch.randn(4, 3, 128), **streams).shape == (4, 8, 7)
-    blind = build(fusion_strategy=fusion, sensor_enabled=False, robot_state_enabled=False)
-    assert list(blind.policy.encoders) == ["features"]
+def test_every_fusion(build: Make, streams: dict[str, Tensor]) -> None:
+    for fusion in ("concat", "cross_attention", "gated", "none"):
+        model = build(fusion_strategy=fusion)
+        assert model(features=torch.randn(4, 3, 128), **streams).shape == (4, 8, 7)
 
 
 @pytest.mark.parametrize(
@@ -573,10 +497,7 @@ def test_every_fusion(
     ],
 )
 def test_aliases_build_the_right_thing(
-    build: Callable[..., QwenVLAUnified],
-    alias: type[QwenVLAUnified],
-    model_type: str,
-    finetune_vl: str,
+    build: Make, alias: type[QwenVLAUnified], model_type: str, finetune_vl: str
 ) -> None:
     model = build(alias, horizon=4)
     assert isinstance(model, QwenVLAUnified)
@@ -586,7 +507,7 @@ def test_aliases_build_the_right_thing(
     assert learns == (finetune_vl == "full")
 
 
-def test_a_wrong_argument_is_refused(build: Callable[..., QwenVLAUnified]) -> None:
+def test_a_wrong_argument_is_refused(build: Make) -> None:
     with pytest.raises(ValidationError, match="horizont"):
         build(horizont=4)
     with pytest.raises(ValidationError, match="lora_r"):

@@ -33,6 +33,8 @@ from pipeline.train.run import policy_shape
 from pipeline.train.split import split_by_episode
 from pipeline.train.training_data import source_of, split_parts
 
+Make = Callable[..., Any]
+
 PARAMS = {
     "sensor_encoder": {"channels": [16], "layers": 0, "heads": 1, "output_dim": 16},
     "state_encoder": {"dim": 8, "layers": 0, "heads": 1, "output_dim": 8, "patch": 1},
@@ -94,11 +96,9 @@ def held_out(store: FeatureStore) -> np.ndarray:
 
 
 @pytest.fixture(scope="module")
-def study(
-    tiny_store: Callable[..., Path], tmp_path_factory: pytest.TempPathFactory
-) -> AblationStudy:
-    store = FeatureStore.open(tiny_store(tmp_path_factory.mktemp("study"), episodes=20))
-    checkpoint, policy = trained(store, 250)
+def study(tiny_store: Make, tmp_path_factory: pytest.TempPathFactory) -> AblationStudy:
+    store = FeatureStore.open(tiny_store(tmp_path_factory.mktemp("study"), episodes=14))
+    checkpoint, policy = trained(store, 200)
     found = evaluate_ablation(checkpoint, policy, store, held_out(store), rules(store), 64)
     assert found is not None
     return found
@@ -137,9 +137,9 @@ def test_the_ways_to_spoil_are_those_that_mean_something(study: AblationStudy) -
 
 
 def test_the_figures_are_the_same_in_table_and_files(
-    study: AblationStudy, tiny_store: Callable[..., Path], tmp_path: Path
+    study: AblationStudy, tiny_store: Make, tmp_path: Path
 ) -> None:
-    store = FeatureStore.open(tiny_store(tmp_path, episodes=20))
+    store = FeatureStore.open(tiny_store(tmp_path, episodes=14))
     multiple = times(study, "sensor", "zeroed")
     ticks = np.arange(4)
     predictions = Predictions(ticks, ticks * 0, *[np.zeros((4, 1, 5), np.float32)] * 2, ticks > 0)
@@ -170,7 +170,7 @@ def test_the_figures_are_the_same_in_table_and_files(
 
 
 def test_missing_is_judged_where_training_dropped_the_stream(
-    tiny_store: Callable[..., Path], tmp_path: Path
+    tiny_store: Make, tmp_path: Path
 ) -> None:
     store = FeatureStore.open(tiny_store(tmp_path))
     checkpoint, policy = trained(store, 1, drop_sensor=0.2, robot_state_enabled=False)
@@ -187,7 +187,7 @@ def test_missing_is_judged_where_training_dropped_the_stream(
 
 
 def test_one_held_out_episode_has_nobody_to_be_shuffled_with(
-    tiny_store: Callable[..., Path], tmp_path: Path
+    tiny_store: Make, tmp_path: Path
 ) -> None:
     store = FeatureStore.open(tiny_store(tmp_path))
     checkpoint, policy = trained(store, 1)
@@ -232,7 +232,7 @@ def test_an_episode_without_the_stream_gives_and_takes_nothing(
 
 @pytest.mark.parametrize(("lacking", "judged"), [([1], 54), ([0, 1, 2], 0)])
 def test_a_stream_is_ablated_where_the_episodes_have_it(
-    tiny_store: Callable[..., Path], tmp_path: Path, lacking: list[int], judged: int
+    tiny_store: Make, tmp_path: Path, lacking: list[int], judged: int
 ) -> None:
     """Of three episodes with 27 ticks each, some lack the sensor."""
     store = FeatureStore.open(tiny_store(tmp_path))
@@ -269,7 +269,7 @@ def test_an_alteration_leaves_the_batch_and_the_other_streams_alone(store: Featu
 
 
 def test_features_go_back_whole_rows_and_say_the_true_time(
-    tiny_store: Callable[..., Path], tmp_path: Path
+    tiny_store: Make, tmp_path: Path
 ) -> None:
     store = FeatureStore.open(tiny_store(tmp_path, reuse=1))
     assert delays(store, "features") == {
@@ -285,7 +285,7 @@ def test_features_go_back_whole_rows_and_say_the_true_time(
 
 @pytest.mark.parametrize(("ticks", "how"), [(2, "delayed 330 ms"), (1, "delayed inf ms")])
 def test_the_time_between_episodes_is_no_step_of_ticks(
-    tiny_store: Callable[..., Path], tmp_path: Path, ticks: int, how: str
+    tiny_store: Make, tmp_path: Path, ticks: int, how: str
 ) -> None:
     """Where recorded rows are the ticks, their median step says how long a delay is."""
     store = FeatureStore.open(tiny_store(tmp_path, ticks=ticks))
@@ -297,17 +297,15 @@ def test_the_time_between_episodes_is_no_step_of_ticks(
     assert list(delays(store, "features")) == [how]
 
 
-@pytest.mark.parametrize(("asked", "judged"), [(1, 1), (16, 4)])
-def test_a_study_of_a_sampling_policy_is_of_few_samples(
-    tiny_store: Callable[..., Path], tmp_path: Path, asked: int, judged: int
-) -> None:
+def test_a_study_of_a_sampling_policy_is_of_few_samples(tiny_store: Make, tmp_path: Path) -> None:
     store = FeatureStore.open(tiny_store(tmp_path))
     checkpoint, policy = trained(store, 1, model_type="flow_matching")
     ticks = held_out(store)
-    found = evaluate_ablation(checkpoint, policy, store, ticks, rules(store), 64, samples=asked)
-    assert found is not None
-    assert found.samples == judged
-    assert f"{judged} chunk(s) a tick" in ablation_text(found)
-    few = evaluate_ablation(checkpoint, policy, store, ticks, rules(store), 64, samples=judged)
-    assert few is not None
-    assert few.intact.overall("policy") == found.intact.overall("policy")
+    many, few = (
+        evaluate_ablation(checkpoint, policy, store, ticks, rules(store), 64, samples=asked)
+        for asked in (16, 4)
+    )
+    assert many is not None and few is not None
+    assert many.samples == few.samples == 4
+    assert "4 chunk(s) a tick" in ablation_text(many)
+    assert few.intact.overall("policy") == many.intact.overall("policy")

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,6 +11,9 @@ from pipeline.evaluate import baselines as rules
 from pipeline.evaluate.baselines import BASELINES, METHODS, Baselines, recorded_chunks
 from pipeline.policy.normalization import ChannelStatistics
 from pipeline.store import FeatureStore
+
+Patch = pytest.MonkeyPatch
+Make = Callable[..., Any]
 
 TRAIN = np.arange(90, 180)
 ABSOLUTE = {"kind": "absolute"}
@@ -36,7 +40,7 @@ def test_each_rule_by_hand(store: FeatureStore) -> None:
 
 
 def test_absolute_actions_are_not_repeated_from_nothing(
-    store: FeatureStore, monkeypatch: pytest.MonkeyPatch
+    store: FeatureStore, monkeypatch: Patch
 ) -> None:
     absolute = store.streams | {"action": store.streams["action"] | ABSOLUTE}
     monkeypatch.setattr(FeatureStore, "streams", absolute)
@@ -46,9 +50,7 @@ def test_absolute_actions_are_not_repeated_from_nothing(
     assert np.array_equal(found, [median, action[0], median])
 
 
-def test_the_linear_fit_continues_what_is_linear(
-    tiny_store: Callable[..., Path], tmp_path: Path
-) -> None:
+def test_the_linear_fit_continues_what_is_linear(tiny_store: Make, tmp_path: Path) -> None:
     """Each action is 1.5 times the last less 0.6 times the one before, plus 0.1: so is its fit."""
     store = FeatureStore.open(tiny_store(tmp_path, episodes=12))
     action = store.array("tick/action")
@@ -67,7 +69,7 @@ def test_the_linear_fit_continues_what_is_linear(
 
 @pytest.mark.parametrize("width", [3, 256])
 def test_the_nearest_neighbour_of_a_training_tick_is_itself(
-    store: FeatureStore, monkeypatch: pytest.MonkeyPatch, width: int
+    store: FeatureStore, monkeypatch: Patch, width: int
 ) -> None:
     monkeypatch.setattr(rules, "_WIDTH", width)
     monkeypatch.setattr(rules, "_ROWS", 7)
@@ -75,9 +77,7 @@ def test_the_nearest_neighbour_of_a_training_tick_is_itself(
     assert np.array_equal(found, recorded_chunks(store, TRAIN, 4)[0])
 
 
-def test_state_and_features_both_decide_who_is_near(
-    tiny_store: Callable[..., Path], tmp_path: Path
-) -> None:
+def test_state_and_features_both_decide_who_is_near(tiny_store: Make, tmp_path: Path) -> None:
     store = FeatureStore.open(tiny_store(tmp_path))
     row, end = store.array("tick/vl_row"), store.array("tick/state_end")
     store.array("state/values")[:] = 0
@@ -93,7 +93,7 @@ def test_state_and_features_both_decide_who_is_near(
 
 
 def test_an_angle_is_near_where_it_is_written_a_turn_further(
-    tiny_store: Callable[..., Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tiny_store: Make, tmp_path: Path, monkeypatch: Patch
 ) -> None:
     store = FeatureStore.open(tiny_store(tmp_path))
     pose = {"names": ["pose_a", "pose_b", "pose_r", "joint_1"], "units": ["deg"] * 4}
@@ -108,7 +108,7 @@ def test_an_angle_is_near_where_it_is_written_a_turn_further(
 
 @pytest.mark.parametrize("state_dim", [0, 4])
 def test_a_stream_that_is_missing_leaves_the_other_or_the_median(
-    tiny_store: Callable[..., Path], tmp_path: Path, state_dim: int
+    tiny_store: Make, tmp_path: Path, state_dim: int
 ) -> None:
     store = FeatureStore.open(tiny_store(tmp_path, state_dim=state_dim))
     found = Baselines(store, TRAIN, 2, None).act(TRAIN)

@@ -104,18 +104,15 @@ def test_phases_are_parts_of_the_same_sum() -> None:
     assert error(parts[0], "policy").low is not None
 
 
-@pytest.mark.parametrize(
-    ("figure", "sign", "text"),
-    [
+def test_figures_read_alike() -> None:
+    for figure, sign, text in (
         (Figure(0.27891, 0.25, 0.3049), "", "0.279 (0.250–0.305)"),
         (Figure(-0.01234, -0.05, 0.021), "+", "-0.0123 (-0.0500 to +0.0210)"),
         (Figure(12.34), "", "12.3"),
         (Figure(0.0), "", "0"),
         (Figure(float("nan")), "", "–"),
-    ],
-)
-def test_figures_read_alike(figure: Figure, sign: str, text: str) -> None:
-    assert figure.text(sign) == text
+    ):
+        assert figure.text(sign) == text
 
 
 def test_a_mean_over_ticks_weighs_ticks_and_draws_groups() -> None:

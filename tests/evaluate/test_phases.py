@@ -48,12 +48,8 @@ def test_absolute_actions_rest_where_they_do_not_change(pressed: FeatureStore) -
     assert found[12] == "contact" and found[23] == "hold"
 
 
-def test_without_a_force_there_are_no_phases(store: FeatureStore) -> None:
-    assert set(phases_of(store, TICKS)) == {""}
-
-
-def test_an_episode_without_the_sensor_has_no_phases(
-    tiny_store: Callable[..., Path], tmp_path: Path
+def test_without_a_force_there_are_no_phases(
+    store: FeatureStore, tiny_store: Callable[..., Path], tmp_path: Path
 ) -> None:
-    store = FeatureStore.open(tiny_store(tmp_path, sensor_channels=0))
-    assert set(phases_of(store, TICKS)) == {""}
+    without = FeatureStore.open(tiny_store(tmp_path, sensor_channels=0))
+    assert set(phases_of(store, TICKS)) == set(phases_of(without, TICKS)) == {""}

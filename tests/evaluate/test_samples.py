@@ -43,9 +43,9 @@ def test_the_energy_score_is_lowest_for_the_distribution_that_was_recorded_from(
 
     def score(spread: float) -> float:
         sampled = SampledChunks(np.ones(2))
-        recorded = rng.normal(size=(4000, 1, 2))
-        chunks = spread * rng.normal(size=(6, 4000, 1, 2))
-        sampled(chunks, recorded, np.ones((4000, 1), bool))
+        recorded = rng.normal(size=(1000, 1, 2))
+        chunks = spread * rng.normal(size=(6, 1000, 1, 2))
+        sampled(chunks, recorded, np.ones((1000, 1), bool))
         return float(sampled.energy().mean())
 
     assert score(1.0) < min(score(0.3), score(2.0))

@@ -179,11 +179,6 @@ def test_files_hold_every_dimension_step_episode_and_tick(
     assert float(tick["dx_predicted"]) - float(tick["dx_recorded"]) == pytest.approx(0.1, abs=1e-5)
 
 
-def test_a_number_that_is_none_is_not_left_out(comparison: Comparison) -> None:
-    comparison.scores["policy"].absolute[:, :, 0] = np.nan
-    assert np.isnan(metrics(comparison)["chunk"]["translation_mm"]["policy"]["value"])
-
-
 def test_a_step_no_chunk_reaches_is_empty(
     recorded: Callable[..., Predictions],
     compared: Callable[[Predictions], Comparison],

@@ -16,6 +16,8 @@ from pipeline.policy.normalization import ChannelStatistics, Normalization
 from pipeline.policy.observation import PolicyShape
 from pipeline.policy.policy import Policy
 
+Make = Callable[..., Any]
+
 
 @dataclass
 class Seen(Observation):
@@ -38,7 +40,7 @@ def shape() -> PolicyShape:
 
 
 @pytest.fixture
-def observe(shape: PolicyShape) -> Callable[..., Seen]:
+def observe(shape: PolicyShape) -> Make:
     """`observe(batch=4, sensor_window=13, state_window=25)`: everything valid, random."""
 
     def make(batch: int = 4, sensor_window: int = 13, state_window: int = 25) -> Seen:
@@ -77,7 +79,7 @@ def normalization(shape: PolicyShape) -> Normalization:
 
 
 @pytest.fixture
-def small_params() -> Callable[..., TrainHeadParams]:
+def small_params() -> Make:
     """`small_params(**over)`: widths that run in milliseconds, no dropout."""
 
     def make(**over: Any) -> TrainHeadParams:
@@ -94,9 +96,7 @@ def small_params() -> Callable[..., TrainHeadParams]:
 
 
 @pytest.fixture
-def build_policy(
-    shape: PolicyShape, normalization: Normalization, small_params: Callable[..., TrainHeadParams]
-) -> Callable[..., Policy]:
+def build_policy(shape: PolicyShape, normalization: Normalization, small_params: Make) -> Make:
     """`build_policy(**params)`: a small policy from a fixed seed."""
 
     def make(**over: Any) -> Policy:

@@ -115,15 +115,6 @@ def test_its_description_is_what_serving_needs(
     assert document["normalization"]["action"]["count"] == 60
 
 
-def test_the_same_checkpoint_is_the_same_bytes(
-    checkpoint: PolicyCheckpoint, tmp_path: Path
-) -> None:
-    for name in ("one", "two"):
-        save_policy(tmp_path / name, checkpoint)
-    for file in ("policy.json", "policy.safetensors"):
-        assert (tmp_path / "one" / file).read_bytes() == (tmp_path / "two" / file).read_bytes()
-
-
 def test_a_folder_or_a_run_is_found(checkpoint: PolicyCheckpoint, tmp_path: Path) -> None:
     save_policy(tmp_path / "head" / "best", checkpoint)
     assert find_policy(tmp_path / "head") == tmp_path / "head/best"
@@ -140,47 +131,24 @@ SLOT = {"layer": 0, "norm": True, "pooling": "mean"}
 @pytest.mark.parametrize(
     ("place", "value", "said"),
     [
-        ("format", 99, "format: expected 3, found 99"),
         ("format", 2, "format: expected 3, found 2"),
         ("step", -1, "step: expected greater than or equal to 0, found -1"),
-        ("step", "7", "step: expected a valid integer, found '7'"),
-        ("metrics.val/error", "low", "metrics.val/error: expected a valid number, found 'low'"),
-        ("shape", None, "shape: expected an object, found None"),
         ("shape.action_dim", 0, "shape.action_dim: expected greater than or equal to 1"),
-        ("shape.action_dim", 10**9, "shape.action_dim: expected less than or equal to 1000000"),
-        ("shape.action_dim", 10**400, "shape.action_dim: expected"),  # by pydantic's version
         ("shape.action_groups", ["other"], "shape.action_groups: expected 5, found 1"),
         ("shape.action_groups", ["banana"] * 5, "action_groups.0: expected a text to match"),
         ("shape.state_kinds", ["deg"] * 3, "shape.state_kinds: expected 0 or 4, found 3"),
         ("shape.slots", 4, "shape.slots: expected 3, found 4"),
         ("shape.feature_dim", 9, "shape.feature_dim: expected 8, found 9"),
-        ("shape.sensor_channels", 6, "shape.sensor_channels: expected 0 or 5, found 6"),
-        ("shape.future", 1, "shape.future"),
         ("streams.action.names", ["dx"], "streams.action: 1 names, but 5 units"),
-        ("streams.action.kind", "banana", "streams.action.kind: expected"),
-        ("streams.views", "View1", "streams.views: expected a valid array, found 'View1'"),
         ("streams.views", ["View2"], "feature_spec.views: expected ('View2',), found ('View1',)"),
-        ("feature_spec.digest", 3, "feature_spec.digest: expected a valid string, found 3"),
         ("feature_spec.slots", [{**SLOT, "layer": "a"}] * 3, "feature_spec.slots.0.layer"),
-        ("action_hz", -10.0, "action_hz: expected greater than 0, found -10.0"),
-        ("vlm_reuse_count", True, "vlm_reuse_count: expected a valid integer, found True"),
-        ("instructions", [1], "instructions.0: expected a valid string, found 1"),
         ("split", {"train": {}}, "split: expected train, val, test, found train"),
-        ("split.train.left/a", 3, "split.train.left/a: expected an object, found 3"),
         ("split.train.right/episode_005.ticks", [9, 3], "expected the first before the last"),
-        ("split.train.right/episode_005.ticks", [-1, 3], "ticks.0: expected greater than"),
         ("split.test.left/b", OVERLAPPING, "found some of '0-5' in both train and test"),
-        ("normalization.action.std", [-1.0] * 5, "expected greater than or equal to 0"),
-        (
-            "normalization.state",
-            None,
-            "state: expected mean and std of (4,), found None",
-        ),
+        ("normalization.state", None, "state: expected mean and std of (4,), found None"),
         ("normalization.action.mean", [0.0], "action: expected mean and std of (5,), found ((1,)"),
         ("weights_sha256", "../../x", "weights_sha256: expected a text to match pattern"),
-        ("params.train_head.model_type", "oracle", "params.train_head.model_type: expected"),
         ("params.train_head.future", 1, "params.train_head.future"),
-        ("params.train_head.horizon", 10**9, "params.train_head.horizon: expected less than"),
         ("params.train_head.expert.heads", 7, "heads must divide the width"),
     ],
 )
@@ -204,16 +172,12 @@ def test_a_description_that_is_none_is_named(
     "content",
     [
         b'{"format": 3, "step": NaN}',
-        b'{"format": 3, "step": 1e400}',
-        b'{"format": "\\ud800"}',
         b'{"format": "\xe9"}',
         b'{"format":' + b"[" * 100_000,
-        b'{"a":[' + b"{}," * 600_000 + b"{}]}",
-        b"",
         b"[]",
         None,
     ],
-    ids=["nan", "infinite", "surrogate", "latin", "deep", "heavy", "empty", "list", "pipe"],
+    ids=["nan", "latin", "deep", "list", "pipe"],
 )
 def test_what_is_no_document_is_refused_before_it_is_read(
     checkpoint: PolicyCheckpoint, tmp_path: Path, content: bytes | None
@@ -227,23 +191,11 @@ def test_what_is_no_document_is_refused_before_it_is_read(
             read(tmp_path / "best")
 
 
-def _ten_times(document: dict[str, Any]) -> None:
-    statistics = document["normalization"]["action"]
-    statistics["std"] = [10 * number for number in statistics["std"]]
-
-
-def _fewer_test_ticks(document: dict[str, Any]) -> None:
-    document["split"]["test"]["left/episode_004"]["ticks"] = [20, 30]
-
-
-@pytest.mark.parametrize("alter", [_ten_times, _fewer_test_ticks])
-def test_an_altered_description_is_refused(
-    checkpoint: PolicyCheckpoint, tmp_path: Path, alter: Callable[[dict[str, Any]], None]
-) -> None:
+def test_an_altered_description_is_refused(checkpoint: PolicyCheckpoint, tmp_path: Path) -> None:
     save_policy(tmp_path / "best", checkpoint)
     path = tmp_path / "best/policy.json"
     document = json.loads(path.read_text())
-    alter(document)
+    document["split"]["test"]["left/episode_004"]["ticks"] = [20, 30]
     path.write_text(json.dumps(document))
     with pytest.raises(CheckpointIncomplete, match=r"policy\.json: it was altered"):
         load_policy(tmp_path / "best")
@@ -258,7 +210,6 @@ def _first(weights: dict[str, Any], change: Callable[[Any], Any]) -> dict[str, A
     ("change", "said"),
     [
         (lambda w: _first(w, lambda v: v.half()), r'"torch.float16", .* -> \["torch.float32"'),
-        (lambda w: _first(w, lambda v: v.long()), r'"torch.int64", .* -> \["torch.float32"'),
         (
             lambda w: _first(w, lambda v: v[:1]),
             "does not fit the policy that policy.json describes",
@@ -267,7 +218,7 @@ def _first(weights: dict[str, Any], change: Callable[[Any], Any]) -> dict[str, A
         (lambda w: {**w, "extra": torch.zeros(3)}, r'extra: \["torch.float32", \[3\]\] -> null'),
         (lambda w: dict(list(w.items())[1:]), r"null -> \[\"torch.float32"),
     ],
-    ids=["float16", "int64", "shorter", "nan", "extra", "missing"],
+    ids=["float16", "shorter", "nan", "extra", "missing"],
 )
 def test_weights_of_another_policy_are_refused(
     checkpoint: PolicyCheckpoint, tmp_path: Path, change: Callable[..., Any], said: str
@@ -327,12 +278,10 @@ class TestGoldenRows:
         ("name", "value"),
         [
             ("0/frames/View1", torch.zeros(6, 8, 3)),
-            ("0/frames/View1", torch.zeros(6, 8, dtype=torch.uint8)),
             ("0/frames/View1", torch.zeros(0, 8, 3, dtype=torch.uint8)),
             ("0/frames/View9", torch.zeros(6, 8, 3, dtype=torch.uint8)),
             ("0/frames/../../x", torch.zeros(6, 8, 3, dtype=torch.uint8)),
             ("9/features", torch.zeros(2)),
-            ("0/features", torch.zeros(2)),
             ("0/slot_valid", torch.zeros(3, dtype=torch.int64)),
         ],
     )

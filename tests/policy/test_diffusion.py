@@ -15,8 +15,6 @@ from pipeline.base.config import DiffusionParams
 from pipeline.policy.diffusion import DiffusionActionExpert
 from pipeline.policy.noise_schedule import NoiseSchedule
 
-PREDICTIONS = ("epsilon", "sample", "v")
-
 
 class Optimal(nn.Module):
     """What the best network says where the chunks are drawn from a mixture."""
@@ -58,22 +56,20 @@ def drawn(expert: DiffusionActionExpert, count: int = 4000, seed: int = 0) -> Te
 
 
 class TestTwoModes:
-    @pytest.mark.parametrize("prediction", PREDICTIONS)
     @pytest.mark.parametrize(
         "arguments",
         [
-            {"sampler": "ddpm", "timesteps": 200},
-            {"sampler": "ddpm", "timesteps": 200, "schedule": "linear"},
-            {"timesteps": 200, "sampling_steps": 100, "eta": 0.0},
-            {"timesteps": 200, "sampling_steps": 100, "eta": 0.0, "schedule": "linear"},
-            {"timesteps": 200, "sampling_steps": 100, "eta": 0.5},
+            {"sampler": "ddpm", "prediction": "epsilon"},
+            {"sampler": "ddpm", "prediction": "sample", "schedule": "linear"},
+            {"sampling_steps": 100, "eta": 0.0, "prediction": "v"},
+            {"sampling_steps": 100, "eta": 0.5, "prediction": "epsilon", "schedule": "linear"},
         ],
         ids=str,
     )
     def test_every_sampler_draws_them(
-        self, arguments: dict[str, Any], prediction: str, two_modes: Any, optimal: Make
+        self, arguments: dict[str, Any], two_modes: Any, optimal: Make
     ) -> None:
-        expert = optimal(two_modes, prediction=prediction, **arguments)
+        expert = optimal(two_modes, timesteps=200, **arguments)
         weights, means, spreads, near = two_modes.judge(drawn(expert))
         torch.testing.assert_close(weights, two_modes.weights, rtol=0, atol=0.025)
         torch.testing.assert_close(means, two_modes.means, rtol=0, atol=0.02)
@@ -90,8 +86,7 @@ class TestTwoModes:
         assert near > 0.97
 
 
-@pytest.mark.parametrize("eta", [0.0, 0.6, 1.0])
-@pytest.mark.parametrize("count", [10, 100])
+@pytest.mark.parametrize(("eta", "count"), [(0.0, 10), (0.6, 10), (1.0, 100)])
 def test_samples_of_a_gaussian_have_the_mean_and_spread_that_theory_gives(
     eta: float, count: int, mixture: Any, optimal: Make
 ) -> None:
@@ -113,7 +108,7 @@ def test_samples_of_a_gaussian_have_the_mean_and_spread_that_theory_gives(
     assert float(samples.std()) == pytest.approx(variance**0.5, rel=0.025)
 
 
-@pytest.mark.parametrize("count", [1, 2, 5, 10])
+@pytest.mark.parametrize("count", [1, 5])
 def test_few_steps_do_not_pull_the_mean_towards_the_noise(
     count: int, mixture: Any, optimal: Make
 ) -> None:
@@ -136,16 +131,15 @@ class TestFlow:
         means, weights = signal * mixture.means[:, 0].double().numpy(), mixture.weights.numpy()
         return brentq(lambda x: weights @ norm.cdf((x - means) / width) - at, -10, 10)
 
-    @pytest.mark.parametrize("schedule", ["cosine", "linear"])
     def test_ddim_takes_quantiles_to_quantiles_as_steps_grow(
-        self, schedule: str, mixture: Any, optimal: Make
+        self, mixture: Any, optimal: Make
     ) -> None:
         line = mixture(torch.tensor([[-0.8], [0.6]]), torch.tensor([0.3, 0.7]), 0.3)
         levels = torch.linspace(0.02, 0.98, 25)
         expected = torch.tensor([self.quantile(line, 1.0, 0.0, float(x)) for x in levels])
         errors = []
         for count in (25, 100, 400):
-            expert = optimal(line, timesteps=1000, schedule=schedule, sampling_steps=count)
+            expert = optimal(line, timesteps=1000, sampling_steps=count)
             step = expert.steps[0]
             signal, noise = (
                 float(x[step]) for x in (expert.schedule.signal, expert.schedule.noise)
@@ -177,8 +171,9 @@ class TestFlow:
 class TestClip:
     """The seeds clamped x0 and then took the step from the unclamped one."""
 
-    @pytest.mark.parametrize("sampler", ["ddpm", "ddim"])
-    @pytest.mark.parametrize("prediction", PREDICTIONS)
+    @pytest.mark.parametrize(
+        ("prediction", "sampler"), [("epsilon", "ddpm"), ("sample", "ddim"), ("v", "ddim")]
+    )
     def test_a_network_gone_wild_stays_within(
         self, prediction: str, sampler: str, two_modes: Any, optimal: Make
     ) -> None:
@@ -223,15 +218,16 @@ class Wild(nn.Module):
         return torch.full_like(noisy, 1e6)
 
 
-@pytest.mark.parametrize("schedule", ["cosine", "linear"])
-@pytest.mark.parametrize("prediction", PREDICTIONS)
+@pytest.mark.parametrize(
+    ("prediction", "schedule"), [("epsilon", "cosine"), ("sample", "linear"), ("v", "cosine")]
+)
 def test_the_best_network_has_the_smallest_loss_there_is(
     prediction: str, schedule: str, mixture: Any, optimal: Make
 ) -> None:
     """The variance of the target given the noisy chunk, over uniform steps of the schedule."""
     gaussian = mixture(torch.tensor([[0.5, -1.0]]), torch.ones(1), 0.6)
     expert = optimal(gaussian, prediction=prediction, schedule=schedule)
-    generator, count = torch.Generator().manual_seed(0), 200_000
+    generator, count = torch.Generator().manual_seed(0), 100_000
     chunk, valid = gaussian.draw(count, generator), torch.ones(count, 1, dtype=torch.bool)
     loss, _ = expert.loss(torch.zeros(count, 1, 8), chunk, valid, generator)
     a, b = expert.schedule.signal[1:].double(), expert.schedule.noise[1:].double()

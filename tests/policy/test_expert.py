@@ -64,24 +64,18 @@ class ActionExpertContract:
         assert set(parts) == set(GROUPS)
         assert not any(part.requires_grad for part in parts.values())
 
-    @pytest.mark.parametrize("garbage", [float("nan"), float("inf"), 1e9])
-    def test_masked_steps_count_nothing(
-        self, garbage: float, expert: ActionExpert, context: torch.Tensor
-    ) -> None:
+    def test_masked_steps_count_nothing(self, expert: ActionExpert, context: torch.Tensor) -> None:
         target, valid = torch.randn(3, 5, 4), everything()
         valid[0, 3:] = False
-        changed = target.masked_fill(~valid.unsqueeze(-1), garbage)
         loss, parts = expert.loss(context, target, valid, seeded())
-        again, same = expert.loss(context, changed, valid, seeded())
-        assert torch.equal(loss, again)
-        assert all(torch.equal(parts[name], same[name]) for name in parts)
+        for garbage in (1e9, float("nan")):
+            changed = target.masked_fill(~valid.unsqueeze(-1), garbage)
+            again, same = expert.loss(context, changed, valid, seeded())
+            assert torch.equal(loss, again)
+            assert all(torch.equal(parts[name], same[name]) for name in parts)
         again.backward()
         assert all(torch.isfinite(p.grad).all() for p in expert.parameters())  # type: ignore
-
-    def test_no_valid_step_gives_a_finite_loss(
-        self, expert: ActionExpert, context: torch.Tensor
-    ) -> None:
-        loss, _ = expert.loss(context, torch.randn(3, 5, 4), ~everything())
+        loss, _ = expert.loss(context, target, ~everything())
         loss.backward()
         assert loss == 0
         assert all(torch.isfinite(p.grad).all() for p in expert.parameters())  # type: ignore
@@ -122,16 +116,6 @@ class ActionExpertContract:
         expert.act(context, seeded())
         expert.loss(context, torch.randn(3, 5, 4, generator=seeded()), everything(), seeded())
         assert torch.equal(torch.get_rng_state(), before)
-
-    def test_without_one_the_global_generator_decides(
-        self, expert: ActionExpert, context: torch.Tensor
-    ) -> None:
-        chunks = []
-        for seed in (1, 1, 2):
-            torch.manual_seed(seed)
-            chunks.append(expert.act(context))
-        assert torch.equal(chunks[0], chunks[1])
-        assert torch.equal(chunks[0], chunks[2]) != expert.stochastic
 
     def test_a_chunk_follows_from_its_own_row(
         self, expert: ActionExpert, context: torch.Tensor
@@ -235,7 +219,6 @@ class TestDiffusion(SamplingExpertContract):
 
     @pytest.fixture(
         params=[
-            {},
             {"prediction": "sample", "schedule": "linear", "clip": None, "sampling_steps": 3},
             {"prediction": "v", "eta": 0.5},
             {"sampler": "ddpm", "timesteps": 12},
@@ -249,7 +232,7 @@ class TestDiffusion(SamplingExpertContract):
 class TestFlowMatching(SamplingExpertContract):
     kind = FlowMatchingActionExpert
 
-    @pytest.fixture(params=[{}, {"time": "beta", "solver": "rk4"}, {"solver": "midpoint"}], ids=str)
+    @pytest.fixture(params=[{}, {"time": "beta", "solver": "rk4"}], ids=str)
     def variant(self, request: pytest.FixtureRequest) -> dict[str, Any]:
         return request.param
 
@@ -257,26 +240,20 @@ class TestFlowMatching(SamplingExpertContract):
 class TestTheAnswerIsNoInput:
     """The seeds' regression was given the target chunk and added to it."""
 
-    def test_predict_takes_the_context_and_nothing_else(self) -> None:
-        parameters = list(inspect.signature(RegressionActionExpert.predict).parameters)
-        assert parameters == ["self", "context"]
-
-    @pytest.mark.parametrize("refinements", [1, 3])
     def test_the_loss_is_that_of_what_act_says_whatever_the_target(
-        self, refinements: int, context: torch.Tensor
+        self, context: torch.Tensor
     ) -> None:
-        expert = regression(refinements)
+        expert = regression(3)
         said = expert.act(context)
         valid = torch.ones(3, 5, dtype=torch.bool)
         for target in (torch.randn(3, 5, 4), 100 * torch.randn(3, 5, 4), said.detach()):
             expected, _ = expert.grouped(said, target, valid)
             assert torch.equal(expert.loss(context, target, valid)[0], expected)
 
-    @pytest.mark.parametrize("refinements", [1, 3])
     def test_the_gradient_to_the_target_comes_from_the_error_alone(
-        self, refinements: int, context: torch.Tensor
+        self, context: torch.Tensor
     ) -> None:
-        expert = regression(refinements)
+        expert = regression(3)
         target = torch.randn(3, 5, 4, requires_grad=True)
         valid = torch.ones(3, 5, dtype=torch.bool)
         loss, _ = expert.loss(context, target, valid)
@@ -340,9 +317,3 @@ def test_default_experts_are_the_seeds(kind: type[ActionExpert], parameters: int
         expert = kind()
     assert (expert.horizon, expert.action_dim) == (8, 7)
     assert sum(p.numel() for p in expert.parameters()) == parameters
-
-
-def test_who_draws_says_so() -> None:
-    assert not RegressionActionExpert.stochastic
-    assert DiffusionActionExpert.stochastic
-    assert FlowMatchingActionExpert.stochastic

@@ -10,11 +10,6 @@ def encoder() -> FeatureEncoder:
     return FeatureEncoder(5, 16, 24)
 
 
-def test_a_token_a_slot(encoder: FeatureEncoder) -> None:
-    valid = torch.ones(3, 5, dtype=torch.bool)
-    assert encoder(torch.randn(3, 5, 16), valid, torch.rand(3)).shape == (3, 5, 24)
-
-
 @pytest.mark.parametrize("content", [7.0, float("nan")])
 def test_invalid_slots_never_reach_the_output(encoder: FeatureEncoder, content: float) -> None:
     features, age = torch.randn(2, 5, 16), torch.rand(2)
@@ -38,12 +33,11 @@ def test_what_is_not_there_has_no_age(encoder: FeatureEncoder) -> None:
     assert differs.tolist() == valid[0].tolist()
 
 
-@pytest.mark.parametrize("age", [float("nan"), float("inf")])
-def test_an_age_of_nothing_reaches_no_gradient(encoder: FeatureEncoder, age: float) -> None:
+def test_an_age_of_nothing_reaches_no_gradient(encoder: FeatureEncoder) -> None:
     features = torch.randn(2, 5, 16)
     valid = torch.tensor([[True, False, True, False, True], [False] * 5])
     found = []
-    for nothing in (0.3, age):
+    for nothing in (0.3, torch.nan):
         encoder.zero_grad()
         tokens = encoder(features, valid, torch.tensor([0.2, nothing]))
         tokens.square().sum().backward()

@@ -68,11 +68,6 @@ class TestSolvers:
         for coarse, fine in pairwise(errors):
             assert math.log2(coarse / fine) == pytest.approx(order, abs=0.15)
 
-    @pytest.mark.parametrize("solver", ["euler", "midpoint", "rk4"])
-    def test_a_straight_line_needs_one_step(self, solver: str) -> None:
-        end = integrate(lambda x, t: torch.full_like(x, 3.0), torch.ones(2), 1, solver)  # type: ignore
-        torch.testing.assert_close(end, torch.full((2,), 4.0))
-
     @pytest.mark.parametrize(("solver", "stages"), [("euler", 1), ("midpoint", 2), ("rk4", 4)])
     def test_the_network_is_asked_once_a_stage(
         self, solver: str, stages: int, two_modes: Any, optimal: Make
@@ -92,18 +87,6 @@ class TestFlow:
         chunk = drawn(optimal(gaussian, solver="rk4", sampling_steps=40), 500)
         expected = gaussian.means + gaussian.spread * noise
         torch.testing.assert_close(chunk, expected, rtol=0, atol=2e-3)
-
-    def test_the_velocity_of_a_gaussian_is_the_change_of_that_map(self, mixture: Any) -> None:
-        gaussian = mixture(torch.tensor([[1.2]]), torch.ones(1), 0.3)
-        noise, t = torch.randn(50, 1, 1, dtype=torch.float64), torch.rand(50, dtype=torch.float64)
-
-        def path(t: Tensor) -> Tensor:
-            t = t.view(-1, 1, 1)
-            return t * 1.2 + ((1 - t) ** 2 + (t * 0.3) ** 2).sqrt() * noise
-
-        change = (path(t + 1e-5) - path(t - 1e-5)) / 2e-5
-        velocity = Optimal(gaussian)(path(t), t, torch.zeros(50, 1, 8))
-        torch.testing.assert_close(velocity, change.float(), rtol=1e-4, atol=1e-4)
 
     def test_on_a_line_it_takes_quantiles_to_quantiles(self, mixture: Any, optimal: Make) -> None:
         """It keeps the order of points, so this is its closed form for any mixture."""
@@ -131,7 +114,7 @@ class TestFlow:
 
 
 class TestTimes:
-    @pytest.mark.parametrize(("alpha", "beta"), [(1.5, 1.0), (0.5, 0.5), (2.0, 5.0), (1.0, 1.0)])
+    @pytest.mark.parametrize(("alpha", "beta"), [(1.5, 1.0), (0.5, 0.5), (2.0, 5.0)])
     def test_the_share_of_noise_is_beta_distributed(self, alpha: float, beta: float) -> None:
         drawn = torch.rand(20_000, generator=torch.Generator().manual_seed(0))
         times = BetaTimes(alpha, beta)(drawn)

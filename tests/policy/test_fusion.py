@@ -1,7 +1,6 @@
 """What every fusion guarantees for every subset of streams, and what each does on its own."""
 
 from collections.abc import Callable
-from itertools import combinations
 
 import pytest
 import torch
@@ -14,7 +13,7 @@ from pipeline.policy.fusion import CrossAttentionFusion, Fusion, GatedFusion, No
 DIM, HEADS = 16, 2
 STRATEGIES = ("concat", "cross_attention", "gated", "none")
 SHAPES = {"features": (5, 12), "sensor": (1, 6), "state": (1, 8)}
-SUBSETS = [subset for count in (1, 2, 3) for subset in combinations(SHAPES, count)]
+SUBSETS = [("features",), ("sensor", "state"), tuple(SHAPES)]
 Encode = Callable[..., dict[str, Tensor]]
 
 
@@ -102,26 +101,24 @@ class TestFusionContract:
         torch.testing.assert_close(rough.float(), exact, atol=0.06, rtol=0.06)
 
 
-@pytest.mark.parametrize("content", [7.0, float("nan")])
 def test_what_stands_in_an_invalid_slot_never_reaches_the_context(
-    strategy: str, content: float
+    strategy: str,
 ) -> None:
     """The features' mask ends in the encoder, as an embedding that every fusion can see."""
     encoder = FeatureEncoder(5, 16)
     fusion = build_fusion(strategy, {"features": (5, encoder.width)}, DIM, HEADS)
     features, age = torch.randn(2, 5, 16), torch.rand(2)
     valid = torch.tensor([[True, False, True, False, True], [False] * 5])
-    changed = features.masked_fill(~valid.unsqueeze(-1), content)
+    changed = features.masked_fill(~valid.unsqueeze(-1), torch.nan)
     context = fusion({"features": encoder(features, valid, age)})
     assert torch.equal(fusion({"features": encoder(changed, valid, age)}), context)
     seen = fusion({"features": encoder(features, torch.ones_like(valid), age)})
     assert (seen - context).abs().amax(dim=(1, 2)).min() > 1e-2
 
 
-@pytest.mark.parametrize("strategy", ["cross_attention"])
-def test_heads_that_do_not_divide_the_width_are_refused(strategy: str) -> None:
+def test_heads_that_do_not_divide_the_width_are_refused() -> None:
     with pytest.raises(ConfigError, match="16 wide cannot have 3 heads"):
-        build_fusion(strategy, SHAPES, DIM, 3)
+        build_fusion("cross_attention", SHAPES, DIM, 3)
 
 
 class TestGates:

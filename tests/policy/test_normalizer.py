@@ -33,7 +33,7 @@ def test_a_constant_channel_is_zero_and_inverts_exactly(value: float, rows: int)
     assert torch.equal(normalizer.invert(normalized), torch.from_numpy(values))
 
 
-@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float64])
+@pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float32, torch.float64])
 def test_any_float_dtype_comes_out_as_float32_and_stays_untouched(dtype: torch.dtype) -> None:
     statistics = ChannelStatistics(np.full((2, 3), 2.0), np.full((2, 3), 4.0), 9)
     stored = torch.full((5, 2, 3), 6.0, dtype=dtype)
@@ -41,12 +41,6 @@ def test_any_float_dtype_comes_out_as_float32_and_stays_untouched(dtype: torch.d
     assert normalized.dtype == torch.float32
     assert (normalized == 1).all()
     assert (stored == 6).all()
-
-
-def test_float32_input_is_not_written_to() -> None:
-    batch = torch.ones(2, 1)
-    Normalizer(ChannelStatistics(np.ones(1), np.ones(1), 2)).normalize(batch)
-    assert (batch == 1).all()
 
 
 def test_statistics_stay_out_of_the_state_dict() -> None:

@@ -49,12 +49,11 @@ class TestWindowEncoderContract:
     def test_shape(self, encoder: nn.Module) -> None:
         assert encoder(windows(3), torch.tensor([0, 5, 13])).shape == (3, OUTPUT)
 
-    @pytest.mark.parametrize("padding", [7.0, float("nan"), float("inf")])
-    def test_padding_never_reaches_the_output(self, encoder: nn.Module, padding: float) -> None:
+    def test_padding_never_reaches_the_output(self, encoder: nn.Module) -> None:
         values, valid = windows(), torch.arange(14)
         changed = values.clone()
         for row, real in enumerate(valid.tolist()):
-            changed[row, : WINDOW - real] = padding
+            changed[row, : WINDOW - real] = torch.nan if row % 2 else 7.0
         assert torch.equal(encoder(values, valid), encoder(changed, valid))
 
     def test_padding_never_reaches_a_gradient(self, encoder: nn.Module) -> None:
@@ -122,7 +121,7 @@ class TestWindowEncoderContract:
         assert (encoder(values) - encoder(values.flip(1))).abs().max() > 1e-3
 
 
-@pytest.mark.parametrize("real", [1, 2, 5, 8])
+@pytest.mark.parametrize("real", [1, 5, 8])
 def test_a_halving_block_sees_padding_as_the_end_of_the_signal(real: int) -> None:
     block = HalvingBlock(CHANNELS, 16)
     values = torch.randn(2, WINDOW, CHANNELS)
@@ -133,14 +132,13 @@ def test_a_halving_block_sees_padding_as_the_end_of_the_signal(real: int) -> Non
     assert not padded[~valid].any()
 
 
-@pytest.mark.parametrize("window", [1, 2, 3, 16, 65])
-@pytest.mark.parametrize("channels", [1, 6])
-def test_sensor_encoder_takes_any_window_and_channel_count(window: int, channels: int) -> None:
-    encoder = SensorEncoder(channels, window, (8, 8), 1, 2, 5)
-    assert encoder(torch.randn(2, window, channels)).shape == (2, 5)
+def test_sensor_encoder_takes_any_window_and_channel_count() -> None:
+    for window, channels in ((1, 1), (2, 6), (3, 1), (16, 6)):
+        encoder = SensorEncoder(channels, window, (8, 8), 1, 2, 5)
+        assert encoder(torch.randn(2, window, channels)).shape == (2, 5)
 
 
-@pytest.mark.parametrize("length", [5, 26, 130])
+@pytest.mark.parametrize("length", [5, 130])
 def test_sensor_windows_of_another_length_are_resampled_without_leaks(
     length: int, sensor_encoder: nn.Module
 ) -> None:
@@ -193,8 +191,7 @@ class TestAges:
         _, stands = at_even_ages(torch.zeros(1, 20, 1), valid, age, 20, 1.0)
         assert stands[0].tolist() == [True] * 9 + [False] * 4 + [True] * 7
 
-    @pytest.mark.parametrize("readings", [7, 26, 300])
-    @pytest.mark.parametrize("real", [1, 5, 7])
+    @pytest.mark.parametrize(("readings", "real"), [(7, 7), (7, 1), (26, 5), (300, 7)])
     def test_a_constant_stays_constant_beside_padding(self, readings: int, real: int) -> None:
         valid = torch.arange(readings)[None] >= readings - real
         values = torch.where(valid[..., None], 5.0, float("nan")).expand(1, readings, 2)
@@ -227,9 +224,10 @@ def test_default_sizes_are_the_seeds() -> None:
     assert sum(p.numel() for p in state.parameters()) == 2020096
 
 
-@pytest.mark.parametrize("configured", [65, 650])
-@pytest.mark.parametrize("length", [65, 100, 650])
-@pytest.mark.parametrize("kind", [SensorEncoder, ForceAwareSensorEncoder])
+@pytest.mark.parametrize(
+    ("kind", "configured", "length"),
+    [(SensorEncoder, 65, 650), (ForceAwareSensorEncoder, 650, 100)],
+)
 def test_windows_of_the_needle_sensor(kind: type[nn.Module], configured: int, length: int) -> None:
     encoder = kind(1026, configured, (8, 8, 16), 1, 2, 12)
     values, valid = torch.randn(2, length, 1026), torch.tensor([length, length // 2])
@@ -255,13 +253,10 @@ class TestForce:
         assert (encoder(force)[:, :own] - before[:, :own]).abs().max() > 1e-2
         assert (encoder(scan)[:, own:] - before[:, own:]).abs().max() > 1e-2
 
-    @pytest.mark.parametrize("seed", [0, 1])
-    def test_a_target_of_force_alone_is_fitted_faster_with_a_branch_of_its_own(
-        self, seed: int
-    ) -> None:
+    def test_a_target_of_force_alone_is_fitted_faster_with_a_branch_of_its_own(self) -> None:
         """Among 256 channels of noise, on windows never seen, after equally many steps."""
-        joint = self.unexplained_after(80, SensorEncoder, seed)
-        aware = self.unexplained_after(80, ForceAwareSensorEncoder, seed)
+        joint = self.unexplained_after(80, SensorEncoder, 0)
+        aware = self.unexplained_after(80, ForceAwareSensorEncoder, 0)
         assert aware < 0.4 * joint
 
     @staticmethod

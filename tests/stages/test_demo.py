@@ -1,6 +1,7 @@
 """The stage hands the params on and ends as every stage ends."""
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 import yaml
@@ -8,6 +9,9 @@ import yaml
 from pipeline.simulation import demo_recordings
 from pipeline.vlm import demo_checkpoint
 from stages import command, demo
+
+Patch = pytest.MonkeyPatch
+Said = pytest.CaptureFixture[str]
 
 
 @pytest.fixture
@@ -31,26 +35,32 @@ def write_weights(folder: Path, seed: int) -> None:
     (folder / "weights").write_text(str(seed), encoding="utf-8")
 
 
-def test_writes_recordings_and_checkpoint(
-    params: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    calls: list[tuple[object, ...]] = []
-    monkeypatch.setattr(
-        demo_recordings, "write_demo_recordings", lambda *given: calls.append(given)
-    )
+@pytest.fixture
+def calls(monkeypatch: pytest.MonkeyPatch) -> list[tuple[object, ...]]:
+    """What recordings were asked for; they and the checkpoint are written in no time."""
+    made: list[tuple[object, ...]] = []
+    monkeypatch.setattr(demo_recordings, "write_demo_recordings", lambda *given: made.append(given))
     monkeypatch.setattr(demo_checkpoint, "write_demo_checkpoint", write_weights)
+    return made
+
+
+def ran(params: Path) -> int:
+    return command.run("", demo.main, ["--params", str(params)])
+
+
+def test_writes_recordings_and_checkpoint(
+    params: Path, calls: list[Any], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     # The second time replaces the demo's own.
     for _ in range(2):
-        assert command.run("", demo.main, ["--params", str(params)]) == 0
+        assert ran(params) == 0
     assert calls == [(tmp_path / "recordings", 2, 5)] * 2
     assert (tmp_path / "vlm" / "weights").read_text(encoding="utf-8") == "5"
     assert [path.name for path in tmp_path.iterdir() if path.is_dir()] == ["vlm"]
     assert "2 episodes" in capsys.readouterr().out
 
 
+@pytest.mark.usefixtures("calls")
 def test_stopped_while_it_writes_the_same_command_goes_on(
     params: Path,
     tmp_path: Path,
@@ -61,26 +71,22 @@ def test_stopped_while_it_writes_the_same_command_goes_on(
         write_weights(folder, seed)
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(demo_recordings, "write_demo_recordings", lambda *given: None)
-    monkeypatch.setattr(demo_checkpoint, "write_demo_checkpoint", stopped)
-    assert command.run("", demo.main, ["--params", str(params)]) == 1
+    with monkeypatch.context() as patched:
+        patched.setattr(demo_checkpoint, "write_demo_checkpoint", stopped)
+        assert ran(params) == 1
     assert capsys.readouterr().err == "stopped; run the same command again\n"
     assert not (tmp_path / "vlm").exists()
-    monkeypatch.setattr(demo_checkpoint, "write_demo_checkpoint", write_weights)
-    assert command.run("", demo.main, ["--params", str(params)]) == 0
+    assert ran(params) == 0
     assert (tmp_path / "vlm/weights").exists()
 
 
+@pytest.mark.usefixtures("calls")
 def test_a_checkpoint_that_the_demo_did_not_write_is_left_alone(
-    params: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    params: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(demo_checkpoint, "write_demo_checkpoint", write_weights)
     (tmp_path / "vlm").mkdir()
     (tmp_path / "vlm" / "weights").write_text("real", encoding="utf-8")
-    assert command.run("", demo.main, ["--params", str(params)]) == 2
+    assert ran(params) == 2
     said = capsys.readouterr().err
     assert "demo.checkpoint" in said and str(tmp_path / "vlm") in said
     assert (tmp_path / "vlm" / "weights").read_text(encoding="utf-8") == "real"
@@ -88,24 +94,20 @@ def test_a_checkpoint_that_the_demo_did_not_write_is_left_alone(
 
 
 def test_foreign_recordings_end_with_2_and_no_checkpoint(
-    params: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    params: Path, tmp_path: Path, capsys: Said
 ) -> None:
     (tmp_path / "recordings" / "precious").mkdir(parents=True)
-    assert command.run("", demo.main, ["--params", str(params)]) == 2
+    assert ran(params) == 2
     assert "demo.recordings" in capsys.readouterr().err
     assert not (tmp_path / "vlm").exists()
 
 
+@pytest.mark.usefixtures("calls")
 def test_what_a_user_put_among_the_demos_files_is_left_alone(
-    params: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    params: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(demo_recordings, "write_demo_recordings", lambda *given: None)
-    monkeypatch.setattr(demo_checkpoint, "write_demo_checkpoint", write_weights)
-    assert command.run("", demo.main, ["--params", str(params)]) == 0
+    assert ran(params) == 0
     (tmp_path / "vlm/model.safetensors").write_text("mine", encoding="utf-8")
-    assert command.run("", demo.main, ["--params", str(params)]) == 2
+    assert ran(params) == 2
     assert f"{tmp_path / 'vlm'}: expected the files that the demo wrote" in capsys.readouterr().err
     assert (tmp_path / "vlm/model.safetensors").read_text(encoding="utf-8") == "mine"

@@ -20,6 +20,8 @@ from pipeline.store.chunks import write_seal
 from stages import evaluate, train_head
 from stages.command import run
 
+Said = pytest.CaptureFixture[str]
+
 ROOT = Path(__file__).resolve().parents[2]
 PICTURES = (
     "curves",
@@ -94,9 +96,7 @@ def test_a_store_that_grew_is_judged_on_the_same_episodes(
     [
         ({"spec_digest": "other"}, 'feature_spec.digest: "tiny-spec" -> "other"'),
         ({"sensor_channels": 7}, "streams.sensor.names"),
-        ({"state_dim": 0}, "streams.state.names"),
         ({"reuse": 2}, "vlm_reuse_count: 3 -> 2"),
-        ({"episodes": 1}, "recordings than they were: right/episode_005"),
         ({"seed": 1}, "recordings than they were: right/episode_005"),
     ],
 )
@@ -104,7 +104,7 @@ def test_another_store_is_refused_by_name(
     trained: Path,
     tiny_store: Callable[..., Path],
     tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
+    capsys: Said,
     store: dict[str, object],
     said: str,
 ) -> None:
@@ -117,18 +117,16 @@ def test_another_store_is_refused_by_name(
     assert "Traceback" not in error
 
 
-@pytest.mark.parametrize("array", ["sensor/values", "vl/features"])
 @pytest.mark.usefixtures("reports")
 def test_a_flipped_bit_is_refused_where_it_would_be_judged_on(
     trained: Path,
     tiny_store: Callable[..., Path],
     flip: Callable[[Path, str], Path],
     tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    array: str,
+    capsys: Said,
 ) -> None:
     store = tiny_store(tmp_path, name="flipped")
-    file = flip(store, array)
+    file = flip(store, "vl/features")
     told = arguments(trained, tmp_path / "report", f"evaluate.store={store}")
     assert run("", evaluate.main, told) == 2
     assert f"{file}: " in capsys.readouterr().err
@@ -136,9 +134,7 @@ def test_a_flipped_bit_is_refused_where_it_would_be_judged_on(
     assert run("", evaluate.main, [*told, "--set", "evaluate.check_store=false"]) == 0
 
 
-def test_a_missing_checkpoint_says_what_to_run(
-    trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_missing_checkpoint_says_what_to_run(trained: Path, tmp_path: Path, capsys: Said) -> None:
     wanted = f"evaluate.checkpoint={tmp_path / 'nowhere'}"
     assert run("", evaluate.main, ["--params", str(trained), "--set", wanted]) == 2
     assert "Run stages.train_head" in capsys.readouterr().err
@@ -146,10 +142,7 @@ def test_a_missing_checkpoint_says_what_to_run(
 
 @pytest.mark.usefixtures("reports")
 def test_without_a_checkpoint_it_judges_what_train_head_wrote(
-    trained: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    trained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Said
 ) -> None:
     """And not an older head that lies where heads lie by default."""
     shutil.copytree(trained.parent / "head", tmp_path / "models/head")
@@ -164,10 +157,7 @@ def test_without_a_checkpoint_it_judges_what_train_head_wrote(
 
 @pytest.mark.usefixtures("reports")
 def test_a_policy_outlives_the_renaming_of_its_source(
-    trained: Path,
-    judged: tuple[Path, str],
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
+    trained: Path, judged: tuple[Path, str], tmp_path: Path, capsys: Said
 ) -> None:
     renamed = Path(shutil.copytree(trained.parent / "tiny.zarr", tmp_path / "renamed.zarr"))
     document = json.loads((renamed / "zarr.json").read_text())
@@ -182,12 +172,6 @@ def test_a_policy_outlives_the_renaming_of_its_source(
         for folder in (judged[0], tmp_path / "report")
     )
     assert after == before
-
-
-@pytest.mark.usefixtures("reports")
-def test_last_can_be_judged_too(trained: Path, tmp_path: Path) -> None:
-    last = f"evaluate.checkpoint={trained.parent / 'head/last'}"
-    assert run("", evaluate.main, arguments(trained, tmp_path / "report", last)) == 0
 
 
 def test_the_report_says_what_was_judged_and_which_streams_are_used(
@@ -262,15 +246,15 @@ def test_a_sampling_policy_is_judged_on_one_sample(trained: Path, tmp_path: Path
     output = tmp_path / "report"
     assert run("", train_head.main, arguments(trained, output, *own)) == 0
     found = []
-    for samples in (1, 8, 8):
+    for samples in (1, 8):
         told = arguments(trained, output, *own, f"evaluate.samples={samples}")
         assert run("", evaluate.main, told) == 0
         document = json.loads((output / "judged.json").read_text())
         assert document["policy"]["samples"] == samples
         assert document["drawn"] == {"samples": samples, "batch_size": 64}
         found.append(json.loads((output / "metrics.json").read_text()))
-    one, many, again = found
-    assert many == again and "samples" not in one
+    one, many = found
+    assert "samples" not in one
     error = many["chunk"]["overall"]["policy"]["value"]
     assert error == many["samples"]["one"]["value"] != one["chunk"]["overall"]["policy"]["value"]
     assert many["samples"]["mean_of_n"]["value"] < error
@@ -279,7 +263,7 @@ def test_a_sampling_policy_is_judged_on_one_sample(trained: Path, tmp_path: Path
 
 @pytest.mark.usefixtures("reports")
 def test_more_steps_than_a_chunk_has_are_not_executed(
-    trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    trained: Path, tmp_path: Path, capsys: Said
 ) -> None:
     told = arguments(trained, tmp_path / "report", "evaluate.execute=9")
     assert run("", evaluate.main, told) == 2
@@ -288,11 +272,7 @@ def test_more_steps_than_a_chunk_has_are_not_executed(
 
 @pytest.mark.parametrize(
     ("environment", "checkpoint", "linked"),
-    [
-        ("phantom", "null", True),
-        ("null", "null", False),
-        ("phantom", "models/another", False),
-    ],
+    [("phantom", "null", True), ("phantom", "models/another", False)],
 )
 def test_the_rollouts_of_this_policy_are_linked_though_they_come_later(
     trained: Path,
@@ -312,7 +292,7 @@ def test_the_rollouts_of_this_policy_are_linked_though_they_come_later(
 
 @pytest.mark.parametrize("stage", [train_head, evaluate])
 def test_an_archive_has_to_be_restored_first(
-    stage: ModuleType, trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    stage: ModuleType, trained: Path, tmp_path: Path, capsys: Said
 ) -> None:
     packed = tmp_path / "tiny.archive.zarr"
     archive(trained.parent / "tiny.zarr", packed, level=1, threads=1)

@@ -51,17 +51,18 @@ def said(capsys: pytest.CaptureFixture[str], params_file: Path, *overrides: str)
     return err
 
 
+def planned(capsys: pytest.CaptureFixture[str], params_file: Path, *overrides: str) -> str:
+    """What a plan that goes well prints."""
+    options = [part for override in overrides for part in ("--set", override)]
+    told = ["--params", str(params_file), "--set", "extract.plan=true", *options]
+    assert run("", main, told) == 0, capsys.readouterr().err
+    return capsys.readouterr().out
+
+
 def test_an_empty_glob(capsys, params_file, tmp_path):
     err = said(capsys, params_file)
     assert "'day*/run' matches nothing" in err
     assert str(tmp_path) in err
-
-
-def test_a_folder_without_episodes(capsys, params_file, tmp_path):
-    (tmp_path / "day1" / "run").mkdir(parents=True)
-    err = said(capsys, params_file)
-    assert "none with an episode" in err
-    assert "metadata.json" in err
 
 
 def test_an_unknown_codebase_version(capsys, params_file, tmp_path):
@@ -78,9 +79,7 @@ def test_a_depth_map_that_is_asked_for_as_a_view(capsys, params_file, tmp_path):
     document["features"]["observation.images.View2"]["info"]["video.is_depth_map"] = True
     info.write_text(json.dumps(document))
     assert "data.views asks for View2" in said(capsys, params_file, "data.views=[View1, View2]")
-    options = ["--params", str(params_file), "--set", "extract.plan=true"]
-    assert run("", main, options) == 0
-    assert "source 'lab': view View2 is a depth map" in capsys.readouterr().out
+    assert "source 'lab': view View2 is a depth map" in planned(capsys, params_file)
 
 
 @pytest.mark.parametrize(
@@ -115,8 +114,7 @@ def test_a_trimmed_copy_is_read_without_the_episodes_before_and_behind(
     root = write_small_lerobot(tmp_path / "day1/run", "v3.0")
     path = root / "meta/episodes/chunk-000/file-000.parquet"
     pq.write_table(pq.ParquetFile(path).read().slice(1, 1), path)
-    options = ["--params", str(params_file), "--set", "extract.plan=true"]
-    assert run("", main, options) == 0, capsys.readouterr().err
+    planned(capsys, params_file)
 
 
 STEP_S = 1762581312.0
@@ -146,8 +144,7 @@ def test_a_clock_whose_type_is_too_coarse(capsys, params_file, tmp_path):
     )
 
 
-@pytest.mark.parametrize("dtype", ["float32", "float16"])
-@pytest.mark.parametrize("name", ["sensor", "state"])
+@pytest.mark.parametrize(("name", "dtype"), [("sensor", "float32"), ("state", "float16")])
 def test_the_clock_of_a_sidecar_may_be_narrow_where_it_begins_at_zero(
     capsys, params_file, tmp_path, name, dtype
 ):
@@ -240,8 +237,13 @@ def _png(frame: Path) -> None:
     frame.unlink()
 
 
-@pytest.mark.parametrize("write", [write_new, partial(write_raw, views=("View1", "View2"))])
-@pytest.mark.parametrize("change", ["all PNGs", "PNGs in one view", "view2/"])
+RAW = partial(write_raw, views=("View1", "View2"))
+
+
+@pytest.mark.parametrize(
+    ("write", "change"),
+    [(write_new, "all PNGs"), (write_new, "view2/"), (RAW, "PNGs in one view"), (RAW, "view2/")],
+)
 def test_no_camera_vanishes(capsys, params_file, tmp_path, write, change):
     folder = write(tmp_path / "day1/run/episode", Truth())
     for frame in [*folder.rglob("View[12]/*.jpg")]:
@@ -250,10 +252,7 @@ def test_no_camera_vanishes(capsys, params_file, tmp_path, write, change):
     if change == "view2/":
         (view,) = folder.rglob("View2")
         view.rename(view.with_name("view2"))
-    options = ["extract.plan=true", "data.views=[View1, View2]"]
-    options = [part for option in options for part in ("--set", option)]
-    assert run("", main, ["--params", str(params_file), *options]) == 0, capsys.readouterr().err
-    assert "has a frame" not in capsys.readouterr().out
+    assert "has a frame" not in planned(capsys, params_file, "data.views=[View1, View2]")
 
 
 @pytest.mark.parametrize(
@@ -272,10 +271,8 @@ def test_what_metadata_promise_and_files_lack(capsys, params_file, tmp_path, los
         shutil.rmtree(path) if path.is_dir() else path.unlink()
     err = said(capsys, params_file, "extract.plan=true")
     assert f"{folder}/metadata.json: {message}. Copy the episode again" in err
-    options = ["data.on_bad_episode=skip", "extract.plan=true"]
-    options = [part for option in options for part in ("--set", option)]
-    assert run("", main, ["--params", str(params_file), *options]) == 0
-    assert re.search(rf"skipped lab: .*lacking.*{message}", capsys.readouterr().out)
+    out = planned(capsys, params_file, "data.on_bad_episode=skip")
+    assert re.search(rf"skipped lab: .*lacking.*{message}", out)
 
 
 def test_recordings_without_any_frame(capsys, params_file, tmp_path):
@@ -283,11 +280,8 @@ def test_recordings_without_any_frame(capsys, params_file, tmp_path):
     features = json.loads(info.read_text())["features"]
     blind = {name: feature for name, feature in features.items() if "images" not in name}
     edit_json(info, features=blind)
-    options = ["--params", str(params_file), "--set", "extract.plan=true"]
-    assert run("", main, options) == 0, capsys.readouterr().err
-    assert "WARNING: none of the 3 episode(s) has a frame" in capsys.readouterr().out
-    assert run("", main, [*options, "--set", "data.views=[]"]) == 0
-    assert "has a frame" not in capsys.readouterr().out
+    assert "WARNING: none of the 3 episode(s) has a frame" in planned(capsys, params_file)
+    assert "has a frame" not in planned(capsys, params_file, "data.views=[]")
 
 
 def test_a_plan_of_known_files_asks_its_ledger_once_and_needs_no_pandas(params_file, tmp_path):
@@ -319,10 +313,7 @@ def test_the_first_ten_of_many_bad_episodes_are_listed(capsys, params_file, tmp_
     err = said(capsys, params_file, "extract.plan=true")
     assert "\n  lab: " in err and err.count("metadata.json: ") == 10
     assert "\nand 3 more episodes\nMend or remove them" in err
-    options = ["data.on_bad_episode=skip", "extract.plan=true"]
-    options = [part for option in options for part in ("--set", option)]
-    assert run("", main, ["--params", str(params_file), *options]) == 0
-    out = capsys.readouterr().out
+    out = planned(capsys, params_file, "data.on_bad_episode=skip")
     assert out.count("\nskipped lab: ") == 10
     assert "\nand 3 more skipped episodes" in out
     assert out.count("not there: lab: ") == 10
@@ -343,7 +334,7 @@ def test_channel_names_of_two_embodiments_are_shown_without_control_characters(
     assert "\x1b" not in err
 
 
-@pytest.mark.parametrize("path", ["/", "/**", "/*", "../" * 30 + "**"])
+@pytest.mark.parametrize("path", ["/*", "../" * 30 + "**"])
 def test_a_path_that_is_the_whole_file_system(capsys, params_file, path):
     err = said(capsys, params_file, f"data.sources=[{{name: lab, path: {path}}}]")
     assert f"found '{path}', the whole file system. Set the source's path to the folder" in err

@@ -7,13 +7,15 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 import yaml
-from PIL import Image
 
 from stages import evaluate, extract, finetune, train_head
 from stages.command import run
+from tests.train.finetuning.conftest import write_episode
+
+Said = pytest.CaptureFixture[str]
+Make = Callable[..., Any]
 
 Start = Callable[..., "subprocess.Popen[str]"]
 HELD = """
@@ -41,7 +43,7 @@ def extracted(tmp_path_factory: pytest.TempPathFactory, demo_checkpoint: Path) -
     """A params.yaml whose store of three recordings is finished."""
     root = tmp_path_factory.mktemp("finetune_stage")
     for seed in range(3):
-        _write_episode(root / "recordings" / "Touch_dot" / f"episode_{seed}", seed)
+        write_episode(root / "recordings" / "Touch_dot" / f"episode_{seed}", seed, ("View1",))
     document = {
         "data": {"root": str(root / "recordings"), "sources": [{"name": "made", "path": "."}]},
         "vlm": {
@@ -69,31 +71,8 @@ def extracted(tmp_path_factory: pytest.TempPathFactory, demo_checkpoint: Path) -
     return path
 
 
-def _write_episode(folder: Path, seed: int) -> None:
-    """Two seconds of one camera and of poses, in the windowed format."""
-    rng = np.random.default_rng(seed)
-    start = 1.7e9 + 10 * seed
-    (folder / "images" / "View1").mkdir(parents=True)
-    for frame in range(21):
-        pixels = rng.integers(0, 255, (24, 32, 3), np.uint8)
-        name = f"{start + frame / 10:.3f}.jpg"
-        Image.fromarray(pixels).save(folder / "images" / "View1" / name)
-    poses = np.cumsum(rng.normal(size=(201, 12)), axis=0).astype(np.float32) * 0.1
-    np.savez(
-        folder / "robot_states.npz", robot_states=poses, joints=poses[:, :6], poses=poses[:, 6:]
-    )
-    metadata = {
-        "episode_name": folder.name,
-        "start_time": start,
-        "end_time": start + 2.0,
-        "camera_views": ["View1"],
-        "robot_hz": 100,
-    }
-    (folder / "metadata.json").write_text(json.dumps(metadata))
-
-
 @pytest.fixture
-def write_params(extracted: Path, tmp_path: Path) -> Callable[..., Path]:
+def write_params(extracted: Path, tmp_path: Path) -> Make:
     """`write_params(name, finetune={...}, ...)`: params that work below the test's folder."""
 
     def write(name: str = "tuned", **sections: dict[str, Any]) -> Path:
@@ -112,11 +91,11 @@ def write_params(extracted: Path, tmp_path: Path) -> Callable[..., Path]:
 
 
 def test_a_flipped_bit_is_refused_before_tuning(
-    write_params: Callable[..., Path],
+    write_params: Make,
     extracted: Path,
     flip: Callable[[Path, str], Path],
     tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
+    capsys: Said,
 ) -> None:
     store = extracted.parent / "made.zarr"
     file = flip(store, "tick/action")
@@ -129,10 +108,7 @@ def test_a_flipped_bit_is_refused_before_tuning(
 
 
 def test_it_tunes_and_says_how_to_go_on_and_that_works(
-    write_params: Callable[..., Path],
-    extracted: Path,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
+    write_params: Make, extracted: Path, tmp_path: Path, capsys: Said
 ) -> None:
     params, seed = str(write_params()), "train_head.seed=1"
     assert run("", finetune.main, ["--params", params, "--set", seed]) == 0
@@ -179,11 +155,9 @@ def test_it_tunes_and_says_how_to_go_on_and_that_works(
     assert "feature_spec.adapter" in capsys.readouterr().err, "these features are not the tuned"
 
 
+@pytest.mark.slow
 def test_killed_in_mid_run_it_ends_where_an_undisturbed_run_ends(
-    started_until: Start,
-    write_params: Callable[..., Path],
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
+    started_until: Start, write_params: Make, tmp_path: Path, capsys: Said
 ) -> None:
     process = started_until(HELD, write_params("killed"), "holding")
     assert run("", finetune.main, ["--params", str(write_params("killed"))]) == 2
@@ -202,9 +176,7 @@ def test_killed_in_mid_run_it_ends_where_an_undisturbed_run_ends(
             assert one.read_bytes() == other.read_bytes()
 
 
-def test_mistakes_end_in_one_message(
-    write_params: Callable[..., Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_mistakes_end_in_one_message(write_params: Make, tmp_path: Path, capsys: Said) -> None:
     params = write_params()
     for override, said in (
         ("finetune.tuning.method=none", "python -m stages.train_head"),

@@ -2,9 +2,9 @@
 
 import os
 import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 import yaml
@@ -15,25 +15,15 @@ from stages import store as stage
 from stages import train_head
 from stages.command import run
 
+Said = pytest.CaptureFixture[str]
+
 Make = Callable[..., Path]
-ROOT = Path(stage.__file__).parents[1]
 
 
 @pytest.fixture
-def params(tmp_path: Path) -> Path:
+def params(tiny_head: Callable[..., dict[str, Any]], tmp_path: Path) -> Path:
     (tmp_path / "stores").mkdir()
-    small = {
-        "sensor_encoder": {"channels": [4], "layers": 0, "heads": 1, "output_dim": 4},
-        "state_encoder": {"dim": 4, "layers": 0, "heads": 1, "output_dim": 4},
-        "expert": {"dim": 4, "layers": 1, "heads": 1},
-        "horizon": 2,
-        "sensor_window": 3,
-        "state_window": 3,
-        "max_steps": 2,
-        "device": "cpu",
-        "output": str(tmp_path / "models" / "head"),
-        "logs": str(tmp_path / "logs"),
-    }
+    small = tiny_head(tmp_path, output=str(tmp_path / "models" / "head"), horizon=2, max_steps=2)
     document = {
         "data": {"sources": [{"name": "left", "path": "a"}, {"name": "right", "path": "b"}]},
         "vlm": {"checkpoint": "unused"},
@@ -54,7 +44,7 @@ def command(params: Path, *arguments: str) -> int:
 
 
 def test_list_names_what_was_trained_on_a_store(
-    params: Path, tiny_store: Make, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    params: Path, tiny_store: Make, tmp_path: Path, capsys: Said
 ) -> None:
     stores = tmp_path / "stores"
     tiny_store(stores, name="one")
@@ -87,7 +77,7 @@ def test_list_names_what_was_trained_on_a_store(
 
 
 def test_merge_gives_a_store_that_trains(
-    params: Path, tiny_store: Make, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    params: Path, tiny_store: Make, tmp_path: Path, capsys: Said
 ) -> None:
     a, b = (str(tiny_store(tmp_path, name=name, seed=seed)) for seed, name in enumerate("ab"))
     into = tmp_path / "stores" / "one.zarr"
@@ -101,7 +91,7 @@ def test_merge_gives_a_store_that_trains(
 
 
 def test_mistakes_end_in_one_message(
-    params: Path, tiny_store: Make, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    params: Path, tiny_store: Make, tmp_path: Path, capsys: Said
 ) -> None:
     a = str(tiny_store(tmp_path, name="a"))
     other = str(tiny_store(tmp_path, name="b", reuse=2))
@@ -123,7 +113,7 @@ def test_mistakes_end_in_one_message(
 
 
 def test_gc_lists_and_removes_only_when_told_to(
-    params: Path, tiny_store: Make, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    params: Path, tiny_store: Make, tmp_path: Path, capsys: Said
 ) -> None:
     stores = tmp_path / "stores"
     tiny_store(stores, name="one")
@@ -151,15 +141,9 @@ def test_gc_lists_and_removes_only_when_told_to(
 
 
 def test_without_a_word_it_lists_and_progress_is_silent(
-    params: Path, tiny_store: Make, tmp_path: Path
+    params: Path, tiny_store: Make, tmp_path: Path, capsys: Said
 ) -> None:
     tiny_store(tmp_path / "stores", name="one")
-    done = subprocess.run(
-        [sys.executable, "-m", "stages.store", "--params", str(params)],
-        capture_output=True,
-        text=True,
-        check=True,
-        env=os.environ | {"PYTHONPATH": str(ROOT)},
-    )
-    assert "one.zarr" in done.stdout
-    assert done.stderr == ""
+    assert command(params) == 0
+    said = capsys.readouterr()
+    assert "one.zarr" in said.out and said.err == ""

@@ -14,8 +14,11 @@ import pytest
 import yaml
 
 from pipeline.store import build_lock
-from stages import evaluate, train_head
+from stages import train_head
 from stages.command import run
+
+Said = pytest.CaptureFixture[str]
+Make = Callable[..., Any]
 
 Start = Callable[..., "subprocess.Popen[str]"]
 WITHOUT_VLM = """
@@ -74,8 +77,8 @@ LONGER = {
 
 @pytest.fixture
 def write_params(
-    tiny_store: Callable[..., Path], tiny_head: Callable[..., dict[str, Any]], tmp_path: Path
-) -> Callable[..., Path]:
+    tiny_store: Make, tiny_head: Callable[..., dict[str, Any]], tmp_path: Path
+) -> Make:
     """`write_params(train_head={...}, store={...})`: a params.yaml on a small store."""
 
     def write(name: str = "params", store: dict[str, Any] | None = None, **head: Any) -> Path:
@@ -101,9 +104,7 @@ def write_params(
 
 
 def test_a_logger_that_is_not_installed_is_named_before_the_store_is_opened(
-    write_params: Callable[..., Path],
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    write_params: Make, monkeypatch: pytest.MonkeyPatch, capsys: Said
 ) -> None:
     monkeypatch.setattr("pipeline.train.log._MODULES", {"wandb": "no_such_module"})
     path = write_params(loggers=["wandb"])
@@ -114,32 +115,31 @@ def test_a_logger_that_is_not_installed_is_named_before_the_store_is_opened(
 
 
 def test_it_trains_evaluates_and_then_has_nothing_to_do(
-    write_params: Callable[..., Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    started: Start, write_params: Make, tmp_path: Path
 ) -> None:
+    """With neither transformers nor peft, and silent where there is no terminal."""
     params = write_params(
         store={"sensor_channels": 0, "episodes": 4, "ticks": 12}, robot_state_enabled=False
     )
-    assert run("", train_head.main, ["--params", str(params)]) == 0
-    said = capsys.readouterr().out
+    process = started(WITHOUT_VLM, params)
+    said, err = process.communicate()
+    assert (process.returncode, err) == (0, "")
     assert "4 episodes, 48 ticks" in said
     assert "sensor: absent from the store, its encoder is disabled" in said
     assert "state: disabled by train_head.robot_state_enabled" in said
     assert "split: 24 training ticks, 12 val, 12 test of 2 + 1 + 1 groups" in said
-    assert "parameters: " in said
-    assert "(features " in said
+    assert "parameters: " in said and "(features " in said
     assert "trained 30 steps in " in said
     assert "device cpu, float32; steps 0 to 30" in said
     assert "step 30: train loss" in said
+    assert "overall [training std]" in said
+    assert "12 test ticks of 1 episode(s)" in said
 
     command = [sys.executable, "-c", NOTHING_TO_DO, "--params", str(params)]
     done = subprocess.run(command, capture_output=True, text=True, check=True)
     assert "nothing to do" in done.stdout
     assert done.stdout.splitlines()[-1] == "[]"
 
-    assert run("", evaluate.main, ["--params", str(params)]) == 0
-    said = capsys.readouterr().out
-    assert "overall [training std]" in said
-    assert "12 test ticks of 1 episode(s)" in said
     report = tmp_path / "params/report"
     found = json.loads((report / "metrics.json").read_text())
     best = json.loads((tmp_path / "params/head/best/policy.json").read_text())
@@ -148,30 +148,8 @@ def test_it_trains_evaluates_and_then_has_nothing_to_do(
     assert {"scatter.png", "horizon.png", "episode_worst.png"} <= set(os.listdir(report))
 
 
-def test_evaluating_twice_gives_the_same_bytes(
-    write_params: Callable[..., Path], tmp_path: Path
-) -> None:
-    params = write_params(max_steps=2, store={"episodes": 3, "ticks": 12})
-    assert run("", train_head.main, ["--params", str(params)]) == 0
-    written = []
-    for _ in range(2):
-        assert run("", evaluate.main, ["--params", str(params)]) == 0
-        report = tmp_path / "params/report"
-        written.append({path.name: path.read_bytes() for path in report.iterdir()})
-    assert written[0] == written[1]
-
-
-def test_stage_two_needs_neither_transformers_nor_peft(
-    started: Start, write_params: Callable[..., Path]
-) -> None:
-    process = started(WITHOUT_VLM, write_params(max_steps=2, store={"episodes": 3, "ticks": 12}))
-    out, err = process.communicate()
-    assert process.returncode == 0, err
-    assert "overall [training std]" in out
-
-
 def test_two_runs_do_not_write_their_curves_into_one_folder(
-    write_params: Callable[..., Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    write_params: Make, tmp_path: Path, capsys: Said
 ) -> None:
     params, logs = write_params(max_steps=2, store={"episodes": 3, "ticks": 12}), tmp_path / "logs"
     arguments = ["--params", str(params), "--set", f"train_head.logs={logs}"]
@@ -184,10 +162,7 @@ def test_two_runs_do_not_write_their_curves_into_one_folder(
 
 
 def test_killed_in_mid_run_it_ends_where_an_undisturbed_run_ends(
-    started_until: Start,
-    write_params: Callable[..., Path],
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
+    started_until: Start, write_params: Make, tmp_path: Path, capsys: Said
 ) -> None:
     undisturbed, killed = write_params("undisturbed"), write_params("killed")
     process = started_until(HELD.format(step=18), killed, "holding")
@@ -213,10 +188,9 @@ def test_killed_in_mid_run_it_ends_where_an_undisturbed_run_ends(
         assert files[0].read_bytes() == files[1].read_bytes()
 
 
+@pytest.mark.slow
 def test_a_sigterm_leaves_the_step_it_came_in(
-    started_until: Start,
-    write_params: Callable[..., Path],
-    tmp_path: Path,
+    started_until: Start, write_params: Make, tmp_path: Path
 ) -> None:
     params = write_params(checkpoint_every=1000)
     process = started_until(HELD.format(step=6), params, "holding")
@@ -229,9 +203,7 @@ def test_a_sigterm_leaves_the_step_it_came_in(
     assert last["step"] == 7
 
 
-def test_mistakes_end_in_one_message(
-    write_params: Callable[..., Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_mistakes_end_in_one_message(write_params: Make, tmp_path: Path, capsys: Said) -> None:
     params = write_params()
     for override, said in (
         ("train_head.store=nowhere.zarr", "no finished store"),
@@ -247,11 +219,7 @@ def test_mistakes_end_in_one_message(
 
 @pytest.mark.parametrize("array", ["sensor/values", "vl/features"])
 def test_a_flipped_bit_is_refused_where_it_would_be_learnt_from(
-    write_params: Callable[..., Path],
-    flip: Callable[[Path, str], Path],
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    array: str,
+    write_params: Make, flip: Callable[[Path, str], Path], tmp_path: Path, capsys: Said, array: str
 ) -> None:
     arguments = ["--params", str(write_params(max_steps=3))]
     file = flip(tmp_path / "params.zarr", array)
@@ -269,10 +237,7 @@ def test_a_flipped_bit_is_refused_where_it_would_be_learnt_from(
 
 
 def test_features_of_another_store_are_refused_although_they_give_their_checksums(
-    write_params: Callable[..., Path],
-    tiny_store: Callable[..., Path],
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
+    write_params: Make, tiny_store: Make, tmp_path: Path, capsys: Said
 ) -> None:
     arguments = ["--params", str(write_params(max_steps=3))]
     store, other = tmp_path / "params.zarr", tiny_store(tmp_path, name="other", seed=9)
@@ -282,10 +247,3 @@ def test_features_of_another_store_are_refused_although_they_give_their_checksum
     error = capsys.readouterr().err
     assert f"{store}/vl/features/c/0/0/0: " in error
     assert "stages.verify --repair" in error
-
-
-def test_progress_is_silent_where_there_is_no_terminal(
-    write_params: Callable[..., Path], capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert run("", train_head.main, ["--params", str(write_params(max_steps=2))]) == 0
-    assert capsys.readouterr().err == ""

@@ -53,7 +53,7 @@ def test_a_sound_store(verified, store, capsys):
     assert said.out.endswith(f"{store}: sound\n")
 
 
-@pytest.mark.parametrize("address", ["nonsense://here", "tcp://127.0.0.1:9", "tls://127.0.0.1:9"])
+@pytest.mark.parametrize("address", ["nonsense://here", "tcp://127.0.0.1:9"])
 def test_an_address_where_no_scheduler_answers(verified, capsys, monkeypatch, address):
     monkeypatch.setattr("pipeline.base.scheduler.TIMEOUT_S", 0.5)
     assert verified("--set", f"verify.workers={address}") == 2
@@ -171,10 +171,6 @@ class TestCheckpoint:
         monkeypatch.setattr("pipeline.base.device.resolve_device", lambda name: "meta")
         assert verified("--checkpoint", str(tmp_path / "head")) == 2
         assert capsys.readouterr().err.startswith("error: 2 of 2 golden rows are not")
-
-    def test_no_checkpoint_there(self, verified, tmp_path, capsys):
-        assert verified("--checkpoint", str(tmp_path / "none")) == 2
-        assert "expected a checkpoint" in capsys.readouterr().err
 
 
 def test_a_damaged_golden_row_is_named_and_repaired(verified, tiny_golden, tmp_path, capsys):

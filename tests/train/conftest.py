@@ -17,6 +17,8 @@ from pipeline.train.loop import Trainer
 from pipeline.train.run import open_run
 from pipeline.train.split import split_by_episode
 
+Make = Callable[..., Any]
+
 KINDS = ("plain", "bfloat16", "variants", "no sensor", "no state")
 SMALL: dict[str, Any] = {
     "sensor_encoder": {"channels": [8, 8], "layers": 1, "heads": 2, "output_dim": 8},
@@ -40,14 +42,12 @@ SMALL: dict[str, Any] = {
 
 
 @pytest.fixture(scope="session")
-def store(
-    tiny_store: Callable[..., Path], tmp_path_factory: pytest.TempPathFactory
-) -> FeatureStore:
+def store(tiny_store: Make, tmp_path_factory: pytest.TempPathFactory) -> FeatureStore:
     return FeatureStore.open(tiny_store(tmp_path_factory.mktemp("training")))
 
 
 @pytest.fixture(scope="session")
-def params_below() -> Callable[..., TrainHeadParams]:
+def params_below() -> Make:
     """`params_below(folder, key=value, ...)`: small params that work below this folder."""
 
     def make(folder: Path, **changed: Any) -> TrainHeadParams:
@@ -58,9 +58,7 @@ def params_below() -> Callable[..., TrainHeadParams]:
 
 
 @pytest.fixture
-def params(
-    params_below: Callable[..., TrainHeadParams], tmp_path: Path
-) -> Callable[..., TrainHeadParams]:
+def params(params_below: Make, tmp_path: Path) -> Make:
     """`params(key=value, ...)`: small params that work below the test's folder."""
     return partial(params_below, tmp_path)
 
@@ -76,11 +74,40 @@ def trainer() -> Callable[[FeatureStore, TrainHeadParams], Trainer]:
     return make
 
 
+class Stop(Exception):
+    """Stands for the end of the process."""
+
+
+@pytest.fixture
+def stop_at(monkeypatch: pytest.MonkeyPatch) -> Callable[[Trainer, int | None], None]:
+    """`stop_at(trainer, step)`: train until this step has begun, and end as a kill does.
+
+    Where `step` is None, the kill comes before the finished run is renamed.
+    """
+    real = Trainer._train_step
+
+    def stop(trainer: Trainer, step: int | None) -> None:
+        def killed(self: Trainer, *rest: Any) -> bool:
+            if self.step == step:
+                raise Stop
+            return real(self, *rest)
+
+        def killed_at_the_end(*rest: object) -> None:
+            raise Stop
+
+        with monkeypatch.context() as patched:
+            patched.setattr(Trainer, "_train_step", killed)
+            if step is None:
+                patched.setattr("pipeline.train.run.TrainingRun.finish", killed_at_the_end)
+            with pytest.raises(Stop):
+                trainer.fit()
+
+    return stop
+
+
 @pytest.fixture(scope="session", params=KINDS)
 def any_store(
-    request: pytest.FixtureRequest,
-    tiny_store: Callable[..., Path],
-    tmp_path_factory: pytest.TempPathFactory,
+    request: pytest.FixtureRequest, tiny_store: Make, tmp_path_factory: pytest.TempPathFactory
 ) -> FeatureStore:
     """Small stores that differ in what they hold, some rows of two variants among them."""
     folder, kind = tmp_path_factory.mktemp("kinds"), request.param

@@ -4,35 +4,20 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from pathlib import Path
+from itertools import count
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
-import zarr
 
 from pipeline.base.config import TrainHeadParams
 from pipeline.store import Batch, FeatureStore
-from pipeline.store.chunks import write_seal
 from pipeline.train.batches import BatchIndices, Lags, Prefetch, Windows, cut_batches, evenly
 
 CPU = torch.device("cpu")
+Make = Callable[..., Any]
 WINDOWS = Windows(horizon=4, sensor_window=6, state_window=5)
-
-
-@pytest.fixture(scope="module")
-def store(
-    tiny_store: Callable[..., Path], tmp_path_factory: pytest.TempPathFactory
-) -> FeatureStore:
-    return FeatureStore.open(tiny_store(tmp_path_factory.mktemp("batches")))
-
-
-def plan(store: FeatureStore, batches: int, size: int = 7) -> list[BatchIndices]:
-    rng = np.random.default_rng(0)
-    return [
-        BatchIndices(rng.integers(0, store.ticks, size), rng.integers(0, store.variants, size))
-        for _ in range(batches)
-    ]
 
 
 def at(*ticks: int) -> BatchIndices:
@@ -52,15 +37,18 @@ def threads() -> int:
     return sum(thread.name.startswith("prefetch") for thread in threading.enumerate())
 
 
-@pytest.mark.parametrize("buffers", [2, 3])
 def test_batches_are_those_of_gather_in_the_order_of_the_plan(
-    store: FeatureStore, buffers: int
+    any_store: FeatureStore, draw_plan: Make
 ) -> None:
-    wanted = plan(store, 25)
-    with Prefetch(store, wanted, WINDOWS, CPU, buffers) as batches:
-        for draw, (found, batch) in zip(wanted, batches, strict=True):
-            assert found is draw
-            assert equal(batch, fresh(store, draw))
+    wanted = draw_plan(any_store, 12)
+    for buffers in (2, 3):
+        with Prefetch(any_store, wanted, WINDOWS, CPU, buffers) as batches:
+            for draw, (found, batch) in zip(wanted, batches, strict=True):
+                assert found is draw
+                assert equal(batch, fresh(any_store, draw))
+                varied = any_store.variants > 1 and draw.variants is not None
+                plain = fresh(any_store, BatchIndices(draw.ticks))
+                assert equal(batch, plain) == (not varied or not draw.variants.any())
 
 
 def test_draws_are_the_ticks_in_order_and_the_plain_frames() -> None:
@@ -73,8 +61,8 @@ def test_draws_are_the_ticks_in_order_and_the_plain_frames() -> None:
     assert all(draw.variants is None for draw in found)
 
 
-def test_lags_are_those_of_gather(store: FeatureStore) -> None:
-    wanted = [replace(indices, lags=Lags(2, 0.1, 0.2)) for indices in plan(store, 2)]
+def test_lags_are_those_of_gather(store: FeatureStore, draw_plan: Make) -> None:
+    wanted = [replace(indices, lags=Lags(2, 0.1, 0.2)) for indices in draw_plan(store, 2)]
     with Prefetch(store, wanted, WINDOWS, CPU) as batches:
         for draw, batch in batches:
             late = fresh(store, draw, feature_lag=2, sensor_lag_s=0.1, state_lag_s=0.2)
@@ -82,30 +70,17 @@ def test_lags_are_those_of_gather(store: FeatureStore) -> None:
             assert not equal(batch, fresh(store, draw))
 
 
-def test_variants_reach_the_store(tiny_store: Callable[..., Path], tmp_path: Path) -> None:
-    path = tiny_store(tmp_path, slots=6)
-    attrs = zarr.open_group(path, mode="r+").attrs
-    spec = attrs.asdict()["feature_spec"]
-    attrs["feature_spec"] = {**spec, "variants": 2}
-    write_seal(path)
-    store = FeatureStore.open(path)
-    assert store.variants == 2
-    wanted = plan(store, 4)
-    with Prefetch(store, wanted, WINDOWS, CPU) as batches:
-        for draw, batch in batches:
-            assert equal(batch, fresh(store, draw))
-            assert not equal(batch, fresh(store, BatchIndices(draw.ticks)))
-
-
-def test_a_batch_is_not_overwritten_before_the_next_is_asked_for(store: FeatureStore) -> None:
-    with Prefetch(store, plan(store, 6), WINDOWS, CPU) as batches:
+def test_a_batch_is_not_overwritten_before_the_next_is_asked_for(
+    store: FeatureStore, draw_plan: Make
+) -> None:
+    with Prefetch(store, draw_plan(store, 6), WINDOWS, CPU) as batches:
         for draw, batch in batches:
             time.sleep(0.02)  # the thread has long filled what it may
             assert torch.equal(batch.sensor, fresh(store, draw).sensor)
 
 
-def test_buffers_are_reused(store: FeatureStore) -> None:
-    with Prefetch(store, plan(store, 12), WINDOWS, CPU) as batches:
+def test_buffers_are_reused(store: FeatureStore, draw_plan: Make) -> None:
+    with Prefetch(store, draw_plan(store, 12), WINDOWS, CPU) as batches:
         places = {batch.sensor.data_ptr() for _, batch in batches}
     assert len(places) == 2
 
@@ -164,15 +139,26 @@ def test_the_plan_is_consumed_no_further_ahead_than_there_are_buffers(store: Fea
         assert len(taken) <= 3
 
 
-def test_waiting_is_measured(store: FeatureStore) -> None:
+def test_waiting_is_measured(store: FeatureStore, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each batch takes 30 ms of a clock that stands still until somebody waits for it."""
+    looks, now, waiting = count(1), [0.0], threading.Semaphore(0)
+
+    def clock() -> float:
+        value = now[0]
+        if next(looks) % 2:  # before the wait, and not behind it
+            waiting.release()
+        return value
+
     def slow() -> Iterator[BatchIndices]:
         for step in range(3):
-            time.sleep(0.03)
+            waiting.acquire()
+            now[0] += 0.03
             yield at(step)
 
+    monkeypatch.setattr("pipeline.train.batches.time.perf_counter", clock)
     with Prefetch(store, slow(), WINDOWS, CPU) as batches:
         assert len(list(batches)) == 3
-        assert batches.waited_s > 0.06
+        assert batches.waited_s == pytest.approx(0.09)
 
 
 def test_a_disabled_encoder_costs_a_single_reading() -> None:
@@ -189,8 +175,8 @@ def test_no_more_ticks_than_asked_for_and_evenly() -> None:
 
 
 @pytest.mark.gpu
-def test_on_a_gpu_batches_are_copies_that_stay(store: FeatureStore) -> None:
-    wanted = plan(store, 12)
+def test_on_a_gpu_batches_are_copies_that_stay(store: FeatureStore, draw_plan: Make) -> None:
+    wanted = draw_plan(store, 12)
     with Prefetch(store, wanted, WINDOWS, torch.device("cuda")) as batches:
         kept = [batch for _, batch in batches]
     for draw, batch in zip(wanted, kept, strict=True):

@@ -30,35 +30,23 @@ Plan = Callable[..., list[BatchIndices]]
 Same = Callable[[Batch, Batch], bool]
 
 
-@pytest.mark.parametrize("fields", FIELDS, ids=lambda fields: "+".join(sorted(fields)))
-@pytest.mark.parametrize("window", [1, 40])
 def test_batches_are_those_of_the_map(
-    any_store: FeatureStore, draw_plan: Plan, same_bits: Same, fields: set[str], window: int
-) -> None:
-    windows, lags = Windows(4, window, window + 1), Lags(2, 0.13, 0.2)
-    wanted = [*draw_plan(any_store, 6), *cut_batches(np.arange(any_store.ticks), 32)]
-    resident = DeviceStore(any_store, fields, CPU)
-    for late in (Lags(), lags):
-        asked = [replace(indices, lags=late) for indices in wanted]
-        with (
-            Prefetch(any_store, asked, windows, CPU) as mapped,
-            Prefetch(any_store, asked, windows, CPU, resident=resident) as device,
-        ):
-            for (draw, expected), (found, batch) in zip(mapped, device, strict=True):
-                assert found is draw
-                assert same_bits(batch, expected)
-                assert batch.sizes == expected.sizes
-
-
-def test_a_batch_stays_as_it_is_until_the_next(
     any_store: FeatureStore, draw_plan: Plan, same_bits: Same
 ) -> None:
-    resident = DeviceStore(any_store, {"features", "sensor"}, CPU)
-    windows = Windows(4, 6, 5)
-    with Prefetch(any_store, draw_plan(any_store, 8), windows, CPU, resident=resident) as batches:
-        for draw, batch in batches:
-            again = any_store.gather(draw.ticks, 4, 6, 5, variants=draw.variants)
-            assert same_bits(batch, again)
+    wanted = [*draw_plan(any_store, 6), *cut_batches(np.arange(any_store.ticks), 32)]
+    for fields in FIELDS:
+        resident = DeviceStore(any_store, fields, CPU)
+        for window, late in ((1, Lags()), (40, Lags()), (40, Lags(2, 0.13, 0.2))):
+            windows = Windows(4, window, window + 1)
+            asked = [replace(indices, lags=late) for indices in wanted]
+            with (
+                Prefetch(any_store, asked, windows, CPU) as mapped,
+                Prefetch(any_store, asked, windows, CPU, resident=resident) as device,
+            ):
+                for (draw, expected), (found, batch) in zip(mapped, device, strict=True):
+                    assert found is draw
+                    assert same_bits(batch, expected), fields
+                    assert batch.sizes == expected.sizes
 
 
 def test_it_is_a_copy(tiny_store: Callable[..., Path], tmp_path: Path) -> None:
@@ -88,11 +76,6 @@ def test_on_a_gpu(
         assert same_bits(batch, expected)
 
 
-def test_auto_on_the_cpu_is_the_map(store: FeatureStore) -> None:
-    line = "feed: mapped (auto: training runs on the cpu)"
-    assert choose_feed("auto", store, CPU) == (frozenset(), line)
-
-
 def test_auto_takes_a_gpu_that_has_room_for_all(store: FeatureStore) -> None:
     fields, line = choose_feed("auto", store, CUDA, free=2**30)
     assert fields == ALL
@@ -103,40 +86,26 @@ def test_auto_takes_a_gpu_that_has_room_for_all(store: FeatureStore) -> None:
     assert line.startswith("feed: mapped (auto: ")
 
 
-def test_device_takes_what_fits_the_smallest_first(store: FeatureStore) -> None:
+def test_device_takes_what_fits_the_smallest_first(
+    store: FeatureStore, tiny_store: Callable[..., Path], tmp_path: Path
+) -> None:
     sizes = {name: store.gatherer.tensor(name).nbytes for name in ALL}
     largest = max(sizes, key=lambda name: sizes[name])
     free = int((sum(sizes.values()) - 1) / 0.6)
     assert choose_feed("device", store, CPU, free)[0] == ALL - {largest}
     assert choose_feed("device", store, CPU, 0)[0] == frozenset()
     assert choose_feed("device", store, CPU)[0] == ALL
-
-
-def test_a_stream_that_is_not_there_needs_no_room(
-    tiny_store: Callable[..., Path], tmp_path: Path
-) -> None:
     lacking = FeatureStore.open(tiny_store(tmp_path, sensor_channels=0))
-    assert choose_feed("device", lacking, CPU)[0] == ALL - {"sensor"}
+    assert choose_feed("device", lacking, CPU)[0] == ALL - {"sensor"}, "it needs no room"
 
 
-@pytest.mark.parametrize("feeds", [("mapped", "device"), ("device", "mapped")])
 def test_a_run_with_another_feed_continues_bit_for_bit(
-    store: FeatureStore, params: Make, trainer: Make, tmp_path: Path, feeds: tuple[str, str]
+    store: FeatureStore, params: Make, trainer: Make, tmp_path: Path, stop_at: Make
 ) -> None:
     whole = trainer(store, params(feed="mapped", output=tmp_path / "whole"))
     whole.fit()
-    stopped = trainer(store, params(feed=feeds[0]))
-    real = stopped._save_last
-
-    def save_and_stop(*rest: Any) -> None:
-        real(*rest)
-        if stopped.step >= 10:
-            raise KeyboardInterrupt
-
-    stopped._save_last = save_and_stop
-    with pytest.raises(KeyboardInterrupt):
-        stopped.fit()
-    again = trainer(store, params(feed=feeds[1]))
+    stop_at(trainer(store, params(feed="mapped")), 11)
+    again = trainer(store, params(feed="device"))
     assert (again.run.status, again.step) == ("resumed", 10)
     again.fit()
     for name, value in weights(whole).items():

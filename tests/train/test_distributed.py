@@ -152,7 +152,7 @@ def ranked(rank: int, port: int, said: Path, script: Path, *arguments: object) -
 
 
 @pytest.fixture
-def two_ranks(fork_server: ForkServerContext, tmp_path: Path) -> Callable[..., str]:
+def two_ranks(fork_server: ForkServerContext, tmp_path: Path) -> Make:
     """`two_ranks(script, ...)`: what the two processes have said, which must end well.
 
     Forked, and without torchrun, which imports for seconds and adds nothing to what they say to
@@ -236,6 +236,7 @@ def test_two_processes_follow_the_curve_of_one_that_accumulates(
     trainer: Make,
     write: Make,
     script: Path,
+    two_ranks: Make,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -250,12 +251,9 @@ def test_two_processes_follow_the_curve_of_one_that_accumulates(
         "loggers": ["tensorboard"],
     }
     together = write("together", grad_accumulation=2, **chosen)
-    process = torchrun(script, json.dumps(case(together)))
-    alone = write("alone", grad_accumulation=4, **chosen)
+    out = two_ranks(script, json.dumps(case(together)))
     monkeypatch.setattr("pipeline.train.loop.LOG_EVERY", 1)
-    done = train_alone(trainer, store, alone)
-    out, err = process.communicate()
-    assert process.returncode == 0, err
+    done = train_alone(trainer, store, write("alone", grad_accumulation=4, **chosen))
     assert "device cpu on 2 processes" in out
     assert out.count("parameters") == 1, "one process speaks"
     assert f"stopped early at step {done.step}" in out
@@ -293,7 +291,7 @@ def test_a_signal_to_torchrun_stops_all_after_one_step_and_one_process_can_go_on
 
 
 def test_what_goes_wrong_is_said_once_and_nobody_waits(
-    write: Make, script: Path, two_ranks: Callable[..., str], tmp_path: Path
+    write: Make, script: Path, two_ranks: Make, tmp_path: Path
 ) -> None:
     """One case after the other between the same two processes, which must all end each."""
     cases = [
@@ -319,6 +317,7 @@ def test_what_goes_wrong_is_said_once_and_nobody_waits(
         assert quiet[1] == ""
 
 
+@pytest.mark.slow
 def test_a_process_that_fails_alone_ends_torchrun(write: Make, script: Path) -> None:
     process = torchrun(script, json.dumps(case(write("together"), fails="step 1")))
     _, err = process.communicate()
@@ -329,7 +328,7 @@ def test_a_process_that_fails_alone_ends_torchrun(write: Make, script: Path) -> 
     assert "Connection closed" not in err
 
 
-def test_what_processes_tell_each_other(two_ranks: Callable[..., str], tmp_path: Path) -> None:
+def test_what_processes_tell_each_other(two_ranks: Make, tmp_path: Path) -> None:
     script = tmp_path / "primitives.py"
     script.write_text(PRIMITIVES)
     said = two_ranks(script)

@@ -17,8 +17,9 @@ from pipeline.base.files import MARKER, read_document, write_document
 from pipeline.store import FeatureStore
 from pipeline.train import log as loggers
 from pipeline.train.log import TrainingLog, check_loggers
-from pipeline.train.loop import Trainer
 from pipeline.train.run import open_run
+
+Patch = pytest.MonkeyPatch
 
 ROOT = Path(__file__).resolve().parents[2]
 LOGS = {MARKER, "plots", "metrics.json"}
@@ -40,10 +41,6 @@ for resumed in (False, True):
 """
 
 
-class Stop(Exception):
-    """Stands for the end of the process."""
-
-
 class Kept:
     """A logger that keeps what it is handed."""
 
@@ -58,25 +55,6 @@ class Kept:
 
     def close(self, finished: bool) -> None:
         self.closed.append(finished)
-
-
-@pytest.fixture
-def stop_at(monkeypatch: pytest.MonkeyPatch) -> Callable[[Trainer, int], None]:
-    """`stop_at(trainer, step)`: train until this step has begun, and end as a kill does."""
-    real = Trainer._train_step
-
-    def stop(trainer: Trainer, step: int) -> None:
-        def killed(self: Trainer, *rest: Any) -> bool:
-            if self.step == step:
-                raise Stop
-            return real(self, *rest)
-
-        with monkeypatch.context() as patched:
-            patched.setattr(Trainer, "_train_step", killed)
-            with pytest.raises(Stop):
-                trainer.fit()
-
-    return stop
 
 
 def scalars(folder: Path) -> dict[str, list[tuple[int, float]]]:
@@ -108,8 +86,8 @@ def test_every_logger_has_the_curves_of_dvc_after_a_stop_too(
     store: FeatureStore,
     params: Make,
     trainer: Make,
-    stop_at: Callable[[Trainer, int], None],
-    monkeypatch: pytest.MonkeyPatch,
+    stop_at: Make,
+    monkeypatch: Patch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     """The stop comes at step 17, the last checkpoint is of step 15: 16 and 17 come again."""
@@ -154,7 +132,7 @@ def test_a_tensorboard_that_has_read_the_killed_start_forgets_it(tmp_path: Path)
 
 
 def test_who_shows_the_curves_decides_no_number(
-    store: FeatureStore, params: Make, trainer: Make, stop_at: Callable[[Trainer, int], None]
+    store: FeatureStore, params: Make, trainer: Make, stop_at: Make
 ) -> None:
     stop_at(trainer(store, params(loggers=[])), 11)
     resumed = trainer(store, params(wandb_project="other"))
@@ -169,28 +147,22 @@ EARLIER = {"loggers": ["report"], "scratch": None, "feed": "compressed"}
 """Keys and values of `train_head` that there were."""
 
 
-@pytest.mark.parametrize("earlier", [{}, EARLIER], ids=["no loggers", "other loggers"])
 def test_a_run_of_an_earlier_version_goes_on(
-    store: FeatureStore,
-    params: Make,
-    trainer: Make,
-    stop_at: Callable[[Trainer, int], None],
-    earlier: dict[str, Any],
+    store: FeatureStore, params: Make, trainer: Make, stop_at: Make
 ) -> None:
     stop_at(trainer(store, params()), 11)
     written = params().output.with_name("head.part") / "last" / "policy.json"
     document = read_document(written, dict)[1]
     head = document["params"]["train_head"]
-    for key in ("loggers", "wandb_project"):
-        del head[key]
-    head |= earlier
+    del head["wandb_project"]
+    head |= EARLIER
     write_document(written, document)
     resumed = trainer(store, params())
     assert (resumed.run.status, resumed.step) == ("resumed", 10)
 
 
 def test_a_missing_package_and_one_that_does_not_load_are_named(
-    tmp_path: Path, params: Make, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, params: Make, monkeypatch: Patch
 ) -> None:
     """What is left of wandb is the folder it makes where it runs; tensorboard is half installed."""
     for name in [
@@ -226,7 +198,7 @@ def test_curves_are_those_that_dvc_plots(tmp_path: Path, params: Make) -> None:
 
 
 def test_a_full_disk_is_named_and_every_logger_is_closed(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: Patch
 ) -> None:
     kept, full = Kept(), Kept()
 
@@ -248,6 +220,7 @@ def test_curves_that_find_no_room_are_a_full_disk(small_disk: Path) -> None:
         log.write(10, {f"train/{name}": 1.0 for name in range(100)})
 
 
+@pytest.mark.slow
 @pytest.mark.extra
 def test_weights_and_biases_keeps_a_run_offline_and_goes_on_under_its_id(tmp_path: Path) -> None:
     # A folder `wandb`, as it leaves where it runs, is no package: it has none of its modules.
@@ -310,7 +283,7 @@ class Service:
 
 
 def test_rows_that_the_service_has_are_not_sent_again_and_its_loss_stops_nothing(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, monkeypatch: Patch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     service = Service(starting_step=21)
     monkeypatch.setitem(sys.modules, "wandb", service)
@@ -324,7 +297,7 @@ def test_rows_that_the_service_has_are_not_sent_again_and_its_loss_stops_nothing
 
 
 def test_a_service_that_takes_no_run_is_said_before_anything_is_done(
-    store: FeatureStore, params: Make, trainer: Make, monkeypatch: pytest.MonkeyPatch
+    store: FeatureStore, params: Make, trainer: Make, monkeypatch: Patch
 ) -> None:
     monkeypatch.setitem(sys.modules, "wandb", Service(refuses="no API key."))
     with pytest.raises(ConfigError, match=r"no API key\. Log in with `wandb login`"):

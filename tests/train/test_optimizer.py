@@ -1,7 +1,6 @@
 """Learning rate, decay groups, averaging, history."""
 
-import math
-from itertools import pairwise
+from itertools import pairwise, product
 
 import pytest
 import torch
@@ -43,14 +42,6 @@ def test_the_rate_warms_up_peaks_and_ends_at_its_floor() -> None:
     assert all(a >= b for a, b in pairwise(rates[10:]))
 
 
-@pytest.mark.parametrize(("warmup", "steps"), [(0, 1), (0, 5), (5, 5), (100, 3), (1, 2)])
-def test_the_rate_is_sane_at_the_extremes(warmup: int, steps: int) -> None:
-    params = TrainHeadParams(warmup_steps=warmup, max_steps=steps, min_lr_fraction=0)
-    rates = [schedule(step, params) for step in range(steps)]
-    assert all(0 <= rate <= 1.0 and math.isfinite(rate) for rate in rates)
-    assert max(rates) == 1.0
-
-
 def test_a_trapezoid_stays_and_then_falls_in_a_line() -> None:
     params = TrainHeadParams(
         lr_schedule="trapezoid",
@@ -76,9 +67,9 @@ def test_a_constant_rate_only_warms_up() -> None:
 
 
 @pytest.mark.parametrize("kind", ["cosine", "trapezoid", "constant"])
-@pytest.mark.parametrize("decay", [0.0, 0.5, 1.0])
-def test_every_schedule_is_sane_at_the_extremes(kind: str, decay: float) -> None:
-    for warmup, steps in ((0, 1), (0, 2), (5, 5), (100, 3), (1, 2), (3, 40)):
+def test_every_schedule_is_sane_at_the_extremes(kind: str) -> None:
+    edges = ((0, 1), (0, 2), (5, 5), (100, 3), (1, 2), (3, 40))
+    for decay, (warmup, steps) in product((0.0, 0.5, 1.0), edges):
         params = TrainHeadParams.model_validate(
             {
                 "lr_schedule": kind,

@@ -58,6 +58,7 @@ def said(code: str, *arguments: object, **environment: str) -> str:
     return done.stdout
 
 
+@pytest.mark.slow
 def test_without_a_compiler_it_says_what_is_missing() -> None:
     found = said(PROBE, CXX="/nowhere/g++")
     assert found.startswith("ConfigError train_head.compile: ")

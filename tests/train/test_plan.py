@@ -34,7 +34,7 @@ def described(parts: list[StepPart]) -> list[tuple[Any, ...]]:
     return [(part.ticks.tolist(), part.share, part.seed) for part in parts]
 
 
-@pytest.mark.parametrize("parts", [1, 2, 3, 8])
+@pytest.mark.parametrize("parts", [2, 3, 8])
 def test_parts_are_the_whole(store: FeatureStore, plan: Make, parts: int) -> None:
     whole, cut = plan(), plan(grad_accumulation=parts)
     for step in range(30):
@@ -48,10 +48,9 @@ def test_parts_are_the_whole(store: FeatureStore, plan: Make, parts: int) -> Non
             assert part.share == pytest.approx(float(here / valid))
 
 
-@pytest.mark.parametrize("size", [2, 4])
-def test_processes_share_the_parts_of_one_that_accumulates(plan: Make, size: int) -> None:
+def test_processes_share_the_parts_of_one_that_accumulates(plan: Make) -> None:
     alone = plan(grad_accumulation=4)
-    together = [plan(ProcessGroup(rank, size), grad_accumulation=4 // size) for rank in range(size)]
+    together = [plan(ProcessGroup(rank, 2), grad_accumulation=2) for rank in range(2)]
     for step in (0, 1, 17):
         apart = [part for each in together for part in each.step(step)]
         assert described(apart) == described(alone.step(step))
@@ -109,25 +108,18 @@ def test_variants_share_no_random_numbers_with_a_part(
             assert rng.integers(2**30, size=8).tolist() != found
 
 
-@pytest.mark.parametrize("parts", [2, 3, 8])
 def test_accumulated_gradients_are_those_of_the_whole_batch(
-    store: FeatureStore, params: Make, trainer: Make, tmp_path: Path, parts: int
+    store: FeatureStore, params: Make, trainer: Make, tmp_path: Path
 ) -> None:
     """Without dropout; ticks near an episode's end give the parts unequal weight."""
     still = {"expert": {"dim": 16, "layers": 1, "heads": 2, "dropout": 0.0}, "horizon": 12}
     runs: list[Trainer] = []
-    for accumulation in (1, parts):
-        run = trainer(
-            store,
-            params(
-                **still,
-                max_steps=8,
-                grad_accumulation=accumulation,
-                output=tmp_path / f"by_{accumulation}",
-            ),
+    for parts in (1, 3):
+        output = tmp_path / f"by_{parts}"
+        runs.append(
+            trainer(store, params(**still, max_steps=5, grad_accumulation=parts, output=output))
         )
-        run.fit()
-        runs.append(run)
+        runs[-1].fit()
     whole, cut = (run.history.tensor() for run in runs)
     assert torch.allclose(whole, cut, rtol=1e-4)
     for a, b in zip(runs[0].policy.parameters(), runs[1].policy.parameters(), strict=True):

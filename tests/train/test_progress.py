@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 from io import StringIO
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,8 @@ from pipeline.train.progress import Progress, describe_data, peak_memory_bytes
 from pipeline.train.run import policy_shape
 from pipeline.train.split import Split, split_by_episode
 from pipeline.train.statistics import fit_normalization
+
+Said = pytest.CaptureFixture[str]
 
 Make = Callable[..., Any]
 CPU = torch.device("cpu")
@@ -51,9 +54,7 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> list[float]:
     return now
 
 
-def test_without_a_terminal_a_line_a_minute(
-    clock: list[float], capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_without_a_terminal_a_line_a_minute(clock: list[float], capsys: Said) -> None:
     with Progress(Waiting(), CPU, range(100, 200)) as progress:
         for _ in range(30):  # steps of 5 s, a reading every second one
             for _ in range(2):
@@ -68,9 +69,7 @@ def test_without_a_terminal_a_line_a_minute(
     ]
 
 
-def test_of_several_processes_one_speaks(
-    clock: list[float], capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_of_several_processes_one_speaks(clock: list[float], capsys: Said) -> None:
     with Progress(Waiting(), CPU, range(2), shown=False) as progress:
         clock[0] += 1e6
         progress.advance()
@@ -79,11 +78,7 @@ def test_of_several_processes_one_speaks(
 
 
 def test_between_evaluations_a_training_says_its_step_and_loss(
-    store: FeatureStore,
-    params: Make,
-    trainer: Make,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    store: FeatureStore, params: Make, trainer: Make, monkeypatch: pytest.MonkeyPatch, capsys: Said
 ) -> None:
     monkeypatch.setattr("pipeline.train.progress.EVERY_S", 0.0)
     monkeypatch.setattr("pipeline.train.loop.LOG_EVERY", 1)
@@ -138,11 +133,10 @@ def test_peak_memory_is_at_least_what_was_held() -> None:
 
 
 def test_the_log_has_speed_memory_and_time_over_all_starts(
-    store: FeatureStore,
-    params: Make,
-    trainer: Make,
-    capsys: pytest.CaptureFixture[str],
+    store: FeatureStore, params: Make, trainer: Make, monkeypatch: pytest.MonkeyPatch, capsys: Said
 ) -> None:
+    readings = count()  # every look at the clock takes a thousandth of a second
+    monkeypatch.setattr("pipeline.train.progress.time.perf_counter", lambda: next(readings) / 1000)
     begun = trainer(store, params(max_steps=30))
     begun._trained_s = 1000.0
     begun.fit()

@@ -16,7 +16,7 @@ from pipeline.train.process_group import ProcessGroup
 from pipeline.train.run import open_run
 
 Make = Callable[..., Any]
-STEPS = 5
+STEPS = 4
 
 
 def weights(trainer: Trainer) -> list[torch.Tensor]:
@@ -24,8 +24,9 @@ def weights(trainer: Trainer) -> list[torch.Tensor]:
     return [value.clone() for state in both for value in state.values()]
 
 
-@pytest.mark.parametrize("model_type", ["regression", "diffusion", "flow_matching"])
-@pytest.mark.parametrize("accumulation", [1, 3])
+@pytest.mark.parametrize(
+    ("model_type", "accumulation"), [("regression", 3), ("diffusion", 1), ("flow_matching", 2)]
+)
 def test_every_step_can_be_gone_on_from(
     store: FeatureStore,
     params: Make,
@@ -72,10 +73,7 @@ def test_every_step_can_be_gone_on_from(
 
 @pytest.fixture(scope="module")
 def of_two_parts(
-    store: FeatureStore,
-    params_below: Make,
-    trainer: Make,
-    tmp_path_factory: pytest.TempPathFactory,
+    store: FeatureStore, params_below: Make, trainer: Make, tmp_path_factory: pytest.TempPathFactory
 ) -> Path:
     """A finished run of two parts a step, to be copied."""
     chosen = params_below(tmp_path_factory.mktemp("parts"), grad_accumulation=2, max_steps=2)
@@ -84,8 +82,7 @@ def of_two_parts(
 
 
 @pytest.mark.parametrize(
-    ("size", "accumulation", "status"),
-    [(1, 2, "finished"), (2, 1, "finished"), (1, 4, "new"), (1, 1, "new"), (2, 2, "new")],
+    ("size", "accumulation", "status"), [(2, 1, "finished"), (1, 4, "new"), (2, 2, "new")]
 )
 def test_parts_may_be_shared_out_anew_but_not_cut_anew(
     store: FeatureStore,

@@ -12,14 +12,9 @@ import pytest
 from pipeline.base.errors import CheckpointIncomplete, CheckpointMismatch, ConfigError
 from pipeline.base.files import HELD, MARKER, begin_folder, read_document
 from pipeline.store import FeatureStore
-from pipeline.train.loop import Trainer
 from pipeline.train.run import RUN_FOLDER, TRAINER_VERSION, open_run
 
 Make = Callable[..., Any]
-
-
-class Stop(Exception):
-    """Stands for the end of the process."""
 
 
 @pytest.fixture(scope="session")
@@ -30,25 +25,22 @@ def params_below(params_below: Make) -> Make:
 
 @pytest.fixture(scope="module")
 def runs(
-    store: FeatureStore,
-    params_below: Make,
-    trainer: Make,
-    tmp_path_factory: pytest.TempPathFactory,
+    store: FeatureStore, params_below: Make, trainer: Make, tmp_path_factory: pytest.TempPathFactory
 ) -> Path:
     """`head`, which is finished, and `stopped.part`, stopped at step 5; both to be copied."""
     folder = tmp_path_factory.mktemp("runs")
     trainer(store, params_below(folder)).fit()
-    real = Trainer._train_step
+    stopped = trainer(store, params_below(folder, output=folder / "stopped"))
+    step = stopped._train_step
 
-    def killed(self: Trainer, *rest: Any) -> bool:
-        if self.step == 5:
-            raise Stop
-        return real(self, *rest)
+    def killed(*rest: Any) -> bool:
+        if stopped.step == 5:
+            raise InterruptedError
+        return step(*rest)
 
-    with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(Trainer, "_train_step", killed)
-        with pytest.raises(Stop):
-            trainer(store, params_below(folder, output=folder / "stopped")).fit()
+    stopped._train_step = killed
+    with pytest.raises(InterruptedError):
+        stopped.fit()
     return folder
 
 
@@ -134,11 +126,7 @@ def test_nothing_is_written_before_the_params_are_known_to_be_good(
 
 
 def test_other_features_or_streams_are_refused(
-    store: FeatureStore,
-    params: Make,
-    unfinished: Path,
-    tiny_store: Callable[..., Path],
-    tmp_path: Path,
+    store: FeatureStore, params: Make, unfinished: Path, tiny_store: Make, tmp_path: Path
 ) -> None:
     other = FeatureStore.open(
         tiny_store(tmp_path, name="other", spec_digest="another", state_dim=0, reuse=5)
@@ -154,11 +142,7 @@ def test_other_features_or_streams_are_refused(
 
 
 def test_other_recordings_of_the_same_kind_begin_anew(
-    store: FeatureStore,
-    params: Make,
-    unfinished: Path,
-    tiny_store: Callable[..., Path],
-    tmp_path: Path,
+    store: FeatureStore, params: Make, unfinished: Path, tiny_store: Make, tmp_path: Path
 ) -> None:
     more = FeatureStore.open(tiny_store(tmp_path, name="more", episodes=7))
     run = open_run(params(), more)
@@ -238,8 +222,9 @@ def test_what_no_training_wrote_is_never_replaced(store: FeatureStore, params: M
     assert (output / "thesis.tex").exists()
 
 
-@pytest.mark.parametrize("beside", [None, "best", "models"])
-@pytest.mark.parametrize("document", ["[1, 2]", "{", '{"sweep": 3}'])
+@pytest.mark.parametrize(
+    ("document", "beside"), [("[1, 2]", None), ('{"sweep": 3}', "models"), ("{", "best")]
+)
 def test_a_run_json_of_another_program_makes_no_training_run(
     store: FeatureStore, params: Make, document: str, beside: str | None
 ) -> None:
@@ -265,18 +250,13 @@ def test_checkpoints_without_their_run_are_not_guessed_at(
         open_run(params(), store)
 
 
-@pytest.mark.parametrize("harm", ["remove", "truncate"])
-@pytest.mark.parametrize(
-    "file", ["best/policy.json", "best/policy.safetensors", "last/policy.json", "best"]
-)
+@pytest.mark.parametrize("file", ["best/policy.safetensors", "last/policy.json", "best"])
 def test_a_damaged_finished_run_is_trained_again(
-    store: FeatureStore, params: Make, trainer: Make, finished: Path, harm: str, file: str
+    store: FeatureStore, params: Make, trainer: Make, finished: Path, file: str
 ) -> None:
     path = finished / file
     if path.is_dir():
         shutil.rmtree(path)
-    elif harm == "remove":
-        path.unlink()
     else:
         path.write_bytes(path.read_bytes()[:-20])
     again = trainer(store, params())
@@ -286,7 +266,7 @@ def test_a_damaged_finished_run_is_trained_again(
     assert open_run(params(), store).status == "finished"
 
 
-@pytest.mark.parametrize("file", ["last/trainer.json", "last/policy.json", "run.json"])
+@pytest.mark.parametrize("file", ["last/trainer.json", "run.json"])
 def test_the_advice_of_a_damaged_unfinished_run_leads_out(
     store: FeatureStore, params: Make, trainer: Make, unfinished: Path, file: str
 ) -> None:
@@ -301,7 +281,7 @@ def test_the_advice_of_a_damaged_unfinished_run_leads_out(
 
 
 def test_a_run_without_a_checkpoint_refuses_no_other_store(
-    store: FeatureStore, params: Make, tiny_store: Callable[..., Path], tmp_path: Path
+    store: FeatureStore, params: Make, tiny_store: Make, tmp_path: Path
 ) -> None:
     open_run(params(), store).begin()
     other = FeatureStore.open(tiny_store(tmp_path, name="other", spec_digest="another"))

@@ -40,7 +40,7 @@ def test_what_is_done_beyond_the_end(
 
 def test_a_run_learns_to_stop(store: FeatureStore, params: Make, trainer: Make) -> None:
     """With a chunk longer than an episode most of what is learnt is standing still."""
-    chosen = {"horizon": 40, "max_steps": 100, "lr": 1e-2, "eval_every": 100}
+    chosen = {"horizon": 40, "max_steps": 60, "lr": 1e-2, "eval_every": 60}
     stopping = trainer(store, params(**chosen, terminal_stop=True))
     stopping.fit()
     batch = store.gather([29, 59], 40, 6, 5)

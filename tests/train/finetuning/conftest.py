@@ -38,7 +38,7 @@ SMALL_TUNING: dict[str, Any] = {
 }
 
 
-def _write_episode(folder: Path, seed: int, views: tuple[str, ...] = VIEWS) -> None:
+def write_episode(folder: Path, seed: int, views: tuple[str, ...] = VIEWS) -> None:
     """Two seconds of the windowed format: the arm goes where a disc stands off the middle."""
     folder.mkdir(parents=True)
     rng = np.random.default_rng(seed)
@@ -81,7 +81,7 @@ def _made(
     root = tmp_path_factory.mktemp("finetuning")
     for seed in range(4):
         views = VIEWS if seed else VIEWS[:1]
-        _write_episode(root / "recordings" / "Follow_disc" / f"episode_{seed}", seed, views)
+        write_episode(root / "recordings" / "Follow_disc" / f"episode_{seed}", seed, views)
     document = {
         "data": {"root": str(root / "recordings"), "sources": [{"name": "made", "path": "."}]},
         "vlm": {

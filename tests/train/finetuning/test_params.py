@@ -33,8 +33,7 @@ def test_what_cannot_be_tuned_is_refused(
         head_params(params(**{section: values}))
 
 
-@pytest.mark.parametrize("section", ["finetune", "train_head"])
-@pytest.mark.parametrize("place", ["output", "logs"])
+@pytest.mark.parametrize(("section", "place"), [("finetune", "output"), ("train_head", "logs")])
 def test_what_is_renamed_is_a_folder_of_its_own(
     params: Callable[..., Params], section: str, place: str
 ) -> None:

@@ -19,6 +19,8 @@ from pipeline.train.finetuning.recordings import (
     known_digests,
 )
 
+Make = Callable[..., Any]
+
 TASK = "Follow_disc"
 
 
@@ -28,7 +30,7 @@ def check(store: FeatureStore, params: Params) -> None:
 
 
 def test_recordings_come_in_the_order_of_episodes_wherever_they_lie(
-    store: FeatureStore, params: Callable[..., Params], own_recordings: Path
+    store: FeatureStore, params: Make, own_recordings: Path
 ) -> None:
     added = own_recordings / TASK / "episode_00"
     shutil.copytree(own_recordings / TASK / "episode_0", added)
@@ -40,7 +42,7 @@ def test_recordings_come_in_the_order_of_episodes_wherever_they_lie(
 
 
 def test_a_missing_recording_is_named(
-    store: FeatureStore, params: Callable[..., Params], own_recordings: Path
+    store: FeatureStore, params: Make, own_recordings: Path
 ) -> None:
     shutil.rmtree(own_recordings / TASK / "episode_2")
     (own_recordings / TASK / "episode_1" / "metadata.json").write_text("{")
@@ -54,15 +56,7 @@ def test_a_missing_recording_is_named(
     assert "python -m stages.extract" in said
 
 
-def test_a_source_that_is_gone_is_named(store: FeatureStore, params: Callable[..., Params]) -> None:
-    renamed = params(data={"sources": [{"name": "other", "path": "."}]})
-    with pytest.raises(StoreMismatch, match=r"made/episode_0: no source has it"):
-        find_recordings(store, renamed)
-
-
-def test_a_changed_file_is_named(
-    store: FeatureStore, params: Callable[..., Params], own_recordings: Path
-) -> None:
+def test_a_changed_file_is_named(store: FeatureStore, params: Make, own_recordings: Path) -> None:
     frame = next((own_recordings / TASK / "episode_1" / "images" / "View1").iterdir())
     Image.new("RGB", (64, 48)).save(frame)
     with pytest.raises(StoreMismatch, match=r"made/episode_1: the files in .* changed since") as no:
@@ -70,24 +64,20 @@ def test_a_changed_file_is_named(
     assert "of its 4 episodes 1 cannot" in str(no.value)
 
 
-def test_a_moved_frame_is_a_change(
-    store: FeatureStore, params: Callable[..., Params], own_recordings: Path
-) -> None:
+def test_a_moved_frame_is_a_change(store: FeatureStore, params: Make, own_recordings: Path) -> None:
     frame = next((own_recordings / TASK / "episode_3" / "images" / "View2").iterdir())
     frame.rename(frame.with_name(f"{float(frame.stem) + 0.004:.3f}.jpg"))
     with pytest.raises(StoreMismatch, match="made/episode_3"):
         check(store, params())
 
 
-def test_another_instruction_is_named(store: FeatureStore, params: Callable[..., Params]) -> None:
+def test_another_instruction_is_named(store: FeatureStore, params: Make) -> None:
     told = params(data={"sources": [{"name": "made", "path": ".", "instruction": "Run away"}]})
     with pytest.raises(StoreMismatch, match="'Follow disc' at extraction, 'Run away' now"):
         check(store, told)
 
 
-def test_the_model_of_the_store_is_asked_for(
-    store: FeatureStore, params: Callable[..., Params]
-) -> None:
+def test_the_model_of_the_store_is_asked_for(store: FeatureStore, params: Make) -> None:
     with known_digests(store) as digests:
         assert check_spec(store, params(), digests).digest == store.spec["digest"]
         # What decides no feature may differ.
@@ -97,13 +87,12 @@ def test_the_model_of_the_store_is_asked_for(
 @pytest.mark.parametrize(
     ("changed", "entry"),
     [
-        ({"prompt": "{instruction}"}, "prompt: "),
         ({"pooling": ["last"]}, "slots: "),
         ({"image_resize_height": 84}, "processor.image_size"),
     ],
 )
 def test_another_model_is_refused_with_the_entries_that_differ(
-    store: FeatureStore, params: Callable[..., Params], changed: dict[str, Any], entry: str
+    store: FeatureStore, params: Make, changed: dict[str, Any], entry: str
 ) -> None:
     vlm = json.loads(params().vlm.model_dump_json()) | changed
     with known_digests(store) as digests, pytest.raises(StoreMismatch) as refused:

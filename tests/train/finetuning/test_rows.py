@@ -21,6 +21,8 @@ from pipeline.train.finetuning.rows import LiveRows
 from pipeline.vlm.feature_spec import FeatureSpec
 from pipeline.vlm.preparation import PreparedRow, Preparer
 
+Make = Callable[..., Any]
+
 
 class Watched(Preparer):
     """Notes the key of each row it makes."""
@@ -55,7 +57,7 @@ def prepare_all(rows: LiveRows, wanted: NDArray[np.int64]) -> dict[int, Prepared
 
 
 def test_rows_show_what_extraction_saw_and_are_decoded_once(
-    store: FeatureStore, params: Callable[..., Params]
+    store: FeatureStore, params: Make
 ) -> None:
     rows, watched = live_rows(store, params())
     wanted = np.random.default_rng(0).integers(0, len(store.array("vl/time")), 200)
@@ -66,7 +68,7 @@ def test_rows_show_what_extraction_saw_and_are_decoded_once(
 
 
 def test_rows_of_a_video_are_read_in_one_pass(
-    document: dict[str, Any], params: Callable[..., Params], tmp_path: Path
+    document: dict[str, Any], params: Make, tmp_path: Path
 ) -> None:
     write_lerobot(tmp_path / "videos", [simulate_episode(5, 1.7e9)])
     document["data"] = {
@@ -84,9 +86,7 @@ def test_rows_of_a_video_are_read_in_one_pass(
     assert watched.keys == keys(store, wanted)
 
 
-def test_kept_rows_stay_within_their_bytes(
-    store: FeatureStore, params: Callable[..., Params]
-) -> None:
+def test_kept_rows_stay_within_their_bytes(store: FeatureStore, params: Make) -> None:
     last = store.episodes[-1].vl_rows
     size = 2 * 56 * 84 * 3
     rows, watched = live_rows(store, params(), cache_bytes=3 * size)
@@ -100,7 +100,7 @@ def test_kept_rows_stay_within_their_bytes(
 
 
 def test_a_frame_that_is_gone_is_named(
-    store: FeatureStore, params: Callable[..., Params], own_recordings: Path
+    store: FeatureStore, params: Make, own_recordings: Path
 ) -> None:
     rows, _ = live_rows(store, params())
     rows.prepare(np.array([0]))
