@@ -59,7 +59,7 @@ class Anchoring:
                 turn = turn if sign > 0 else turn.transpose(-1, -2)
                 step = _vector(_matrix(step.deg2rad()) @ turn).rad2deg()
             else:
-                kinds = [self.kinds[channel] for channel in channels]
+                kinds: list[Kind] = [self.kinds[channel] for channel in channels]
                 step = step + sign * _difference(now[:, channels], then[:, channels], kinds)
             for channel, moved in zip(anchor.action, step.unbind(-1), strict=True):
                 first[channel] = moved
