@@ -81,6 +81,10 @@ ROLLOUTS: dict[str, tuple[str, ...]] = {
     "temporal": ("rollout.chunking=temporal",),
     "rtc": ("rollout.chunking=rtc", "rollout.execute=3"),
     **{late: (f"rollout.latency_ms={ticks * 100}",) for late, ticks in LATE.items()},
+    **{
+        f"temporal, {late}": ("rollout.chunking=temporal", f"rollout.latency_ms={ticks * 100}")
+        for late, ticks in LATE.items()
+    },
     "3 ticks late, 3 steps": ("rollout.latency_ms=300", "rollout.execute=3"),
     "6 ticks late, 6 steps": ("rollout.latency_ms=600", "rollout.execute=6"),
     **{f"{steps} steps": (f"rollout.execute={steps}",) for steps in (2, 3, 4, 6, 8)},
@@ -183,6 +187,7 @@ RECIPES = {
     "somewhat late in training": Recipe(
         ("train_head.feature_lag=1", "train_head.sensor_lag_s=0.05")
     ),
+    "anchored": Recipe(("train_head.anchor=[dx, dy]",)),
     "not averaged": Recipe(("train_head.ema_decay=0.0",)),
     "horizon 16": Recipe(("train_head.horizon=16",)),
     "residual over own motion": Recipe(patches=_RESIDUAL),
@@ -196,7 +201,8 @@ RECIPES = {
     "larger images": Recipe(store="large"),
 }
 
-_LATER = (ON_TIME, *(way for way in ROLLOUTS if "late" in way))
+_LATER = (ON_TIME, *(way for way in ROLLOUTS if "late" in way and "temporal" not in way))
+_AVERAGED = ("temporal", *(f"temporal, {ticks} ticks late" for ticks in (3, 6, 10)))
 TABLES = {
     "experts": Table(
         (AS_IT_IS, "diffusion", "flow matching", "cross attention", "gated", "no fusion")
@@ -219,6 +225,7 @@ TABLES = {
     "checkpoint": Table((AS_IT_IS,), (ON_TIME, "last weights")),
     "levels": Table((AS_IT_IS, "300 demonstrations"), (ON_TIME, "depth", "moved")),
     "latency": Table((AS_IT_IS, "late in training"), _LATER),
+    "anchored": Table((AS_IT_IS, "anchored"), _AVERAGED),
     "chunking": Table((AS_IT_IS,), (ON_TIME, *(f"{n} steps" for n in (2, 3, 4, 6, 8)), "temporal")),
     "guided": Table(("flow matching",), (ON_TIME, "3 steps", "temporal", "rtc")),
     "demonstrations": Table(tuple(f"{count} demonstrations" for count in (10, 30, 100, 300))),

@@ -35,9 +35,6 @@ def test_the_projects_own_params_are_valid():
 
 
 DEMO_ONLY = {
-    # Vision tells its way sideways, while the sensor tells depth.
-    "train_head.anchor",
-    "rollout.chunking",
     "data.sources",
     # The demo's model is small and computes in float32 on a CPU, its frames are small.
     "vlm.dtype",
