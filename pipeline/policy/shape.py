@@ -73,7 +73,7 @@ def find_anchors(
     if unknown := [name for name in wanted if name not in {*told, *composed}]:
         raise ConfigError(
             "train_head.anchor: expected deltas whose motion the state tells "
-            f"({', '.join(told) or 'this store has none'}), found {', '.join(unknown)}"
+            f"({', '.join(told) or 'the training episodes have none'}), found {', '.join(unknown)}"
         )
     anchors = [Anchor((action["names"].index(n),), (told[n],)) for n in wanted if n in told]
     if composed:

@@ -167,6 +167,7 @@ def put_in_place(target: Path, keep: bool = False) -> None:
     """
     previous = previous_path(target)
     if keep and there(target):
+        refuse_foreign(previous, KEPT)
         if not target.is_symlink():
             mark(target, KEPT)  # before the older one goes: a full disk may refuse it
         remove_folder(previous, KEPT)

@@ -272,9 +272,11 @@ def policy_shape(
 ) -> PolicyShape:
     """The widths that this store gives to a policy, and which action channels are anchored.
 
-    A stream without statistics is absent from the training ticks, so it has width 0.
+    A stream without statistics is absent from the training ticks, so it has width 0. Raises
+    `ConfigError` for an anchored channel whose motion no state of the training ticks tells.
     """
     action, state = store.streams["action"], store.streams["state"]
+    told = state if normalization.state else {"names": [], "units": []}
     return PolicyShape(
         *store.feature_shape,
         sensor_channels=store.sensor_channels if normalization.sensor else 0,
@@ -283,7 +285,7 @@ def policy_shape(
         action_groups=action_groups(action["names"], action["units"]),
         views=store.array("vl/frame_time").shape[1],
         state_kinds=channel_kinds(state["names"], state["units"]) if normalization.state else (),
-        anchors=find_anchors(action, state, anchor),
+        anchors=find_anchors(action, told, anchor),
     )
 
 
