@@ -38,6 +38,7 @@ def test_what_a_table_names_can_be_run(name: str, tmp_path: Path) -> None:
             said = [text.format(folder=tmp_path) for text in ROLLOUTS[rollout]]
             load_params(PARAMS, [*told, *said])
         with ExitStack() as patched:
+            patched.enter_context(patch(closed_loop._WRITE_PAGE))
             for place, value in recipe.patches.items():
                 patched.enter_context(patch(place, value))
 
