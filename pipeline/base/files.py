@@ -208,17 +208,15 @@ def recover(complete: Path, target: Path, kind: OutputKind) -> None:
     refuse_foreign(target, kind)
     if there(complete / REPLACED) and not there(target):
         (complete / REPLACED).rename(target)
-    elif (complete / REPLACED).is_symlink():  # the user has put another one back
-        (complete / REPLACED).unlink()
-    else:
-        remove_folder(complete / REPLACED, kind)
     if HELD.marks(earlier := _beside(target, "replaced")):
         if there(earlier / target.name) and not there(target):
             (earlier / target.name).rename(target)
         remove_folder(earlier, HELD)
-    if (target / REPLACED).is_symlink():
-        (target / REPLACED).unlink()
-    remove_folder(target / REPLACED, kind)
+    # In the complete folder it still lies where the user has put another one back.
+    for replaced in (complete / REPLACED, target / REPLACED):
+        if replaced.is_symlink():
+            replaced.unlink()
+        remove_folder(replaced, kind)
 
 
 REPORT = OutputKind(

@@ -11,8 +11,6 @@ from pipeline.extract.survey import CheckedEpisode, Survey
 from pipeline.store import FEATURES, RowSource, StoreBuild, read_plan
 from pipeline.store.schema import ArraySpec
 
-_DECIDES_SPEED = ("weights", "adapter", "processor", "compute_dtype", "variants")
-
 
 def plan_lines(
     build: StoreBuild,

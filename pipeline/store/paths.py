@@ -168,13 +168,13 @@ def put_in_place(target: Path, keep: bool = False) -> None:
     previous = previous_path(target)
     if keep and there(target):
         refuse_foreign(previous, KEPT)
-        if not target.is_symlink():
-            mark(target, KEPT)  # before the older one goes: a full disk may refuse it
-        remove_folder(previous, KEPT)
         if target.is_symlink():
+            remove_folder(previous, KEPT)
             previous.symlink_to(os.path.realpath(target) + _LINK_ENDS)
             target.unlink()
         else:
+            mark(target, KEPT)  # before the older one goes: a full disk may refuse it
+            remove_folder(previous, KEPT)
             target.rename(previous)
     files.put_in_place(part_path(target), target, STORE)
     remove_folder(target / KNOWN, STORE)

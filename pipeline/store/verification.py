@@ -39,7 +39,15 @@ from pipeline.store.chunks import (
 from pipeline.store.episodes import check_index, check_positions
 from pipeline.store.golden import GOLDEN, golden_files, golden_issues
 from pipeline.store.metadata import metadata_damage
-from pipeline.store.paths import KNOWN, Inode, find_attributes, inode_of, read_plan, refuse_replaced
+from pipeline.store.paths import (
+    KNOWN,
+    STORE,
+    Inode,
+    find_attributes,
+    inode_of,
+    read_plan,
+    refuse_replaced,
+)
 from pipeline.store.reader import FeatureStore, map_array, place
 from pipeline.store.schema import (
     ARRAY_NAMES,
@@ -296,12 +304,12 @@ def strange_files(
     }
     expected |= {path for spec in specs.values() for path in chunk_paths(root, spec)}
     unjudged = {*ARRAY_NAMES} - {*specs} | ({GOLDEN} if golden is None else set[str]())
+    # What a replacement that was stopped left there: the next extraction removes it.
+    unjudged |= {name for name in (REPLACED, KNOWN) if STORE.owns(root / name)}
     prefixes = tuple(f"{root / name}/" for name in unjudged)
     files = (Path(folder) / file for folder, _, names in os.walk(root) for file in names)
     for path in sorted(files):
         if path not in expected and not str(path).startswith(prefixes):
-            if path.relative_to(root).parts[0] in (REPLACED, KNOWN):
-                continue  # of a replacement that was stopped: the next extraction removes it
             what = "has no place in a store, look at it and remove it"
             yield _Error(kind="strange file", message=what, file=path)
 

@@ -365,6 +365,10 @@ def test_what_kills_left_of_replacements_goes(tiny_store: Make, tmp_path: Path) 
     # A third one while the old store was removed from inside the new one.
     shutil.copytree(target, target / ".replaced")
     assert not list(strange_files(target, read_specs(target), set(target.glob("golden/**/*"))))
+    (target / ".known").mkdir()
+    (target / ".known" / "mine").touch()
+    (strange,) = strange_files(target, read_specs(target), set(target.glob("golden/**/*")))
+    assert strange.file == target / ".known" / "mine", "no marker says that it is the project's"
 
 
 def test_a_build_behind_a_link_is_refused(tiny_store: Make, tmp_path: Path) -> None:
