@@ -2,8 +2,6 @@
 
 import json
 import os
-import shutil
-from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
@@ -27,16 +25,13 @@ from pipeline.base.files import (
     write_tensors,
     write_with_digest,
 )
+from tests.faults.killing import Killed, killed_before
 
 KIND = OutputKind("a folder of this test", lambda folder: (folder / "a").is_file())
 
 
 def put(folder: Path, text: str) -> None:
     replace_folder(folder, lambda temporary: (temporary / "a").write_text(text) and None, KIND)
-
-
-class Killed(BaseException):
-    """Stands for the end of the process: nothing after it runs, no clean-up either."""
 
 
 @pytest.mark.parametrize("survived", range(7))
@@ -107,28 +102,6 @@ def test_a_kill_at_any_step_of_a_replacement_is_undone_or_completed(
             assert kill_at >= 4
             return
     raise AssertionError("more steps than expected")
-
-
-def killed_before(step: int, act: Callable[[], None]) -> bool:
-    count = iter(range(10**6))
-
-    def counted(real):
-        def call(*arguments, **keywords):
-            if next(count) == step:
-                raise Killed
-            return real(*arguments, **keywords)
-
-        return call
-
-    with pytest.MonkeyPatch.context() as patch:
-        for name in ("rename", "mkdir", "write_text", "unlink", "symlink_to"):
-            patch.setattr(Path, name, counted(getattr(Path, name)))
-        patch.setattr(shutil, "rmtree", counted(shutil.rmtree))
-        try:
-            act()
-        except Killed:
-            return True
-    return False
 
 
 @pytest.mark.parametrize("gone", [False, True])

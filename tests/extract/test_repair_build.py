@@ -15,6 +15,7 @@ from pipeline.store import FeatureStore, StoreBuild, part_path, read_plan
 from pipeline.store.chunks import write_seal
 from pipeline.store.schema import chunk_paths, read_spec, read_specs
 from pipeline.store.verification import verify
+from tests.faults.killing import killed_before
 
 ROW_BYTES = 3 * 8 * 4
 
@@ -158,10 +159,6 @@ def test_a_store_that_was_replaced_since_it_was_checked_gives_no_row(original, s
         begin_from_store(verification)
 
 
-class Killed(BaseException):
-    """Stands for SIGKILL: nothing may catch it."""
-
-
 def test_a_kill_at_any_step_leaves_the_store_and_a_repair_to_be_started_again(original, tmp_path):
     steps = [
         (os, "link"),
@@ -173,28 +170,13 @@ def test_a_kill_at_any_step_leaves_the_store_and_a_repair_to_be_started_again(or
     for kill_at in range(0, 200, 3):
         store = Path(shutil.copytree(original, tmp_path / str(kill_at) / "tiny.zarr"))
         flip_row_17(chunk_file(store, "vl/features"))
-        damaged, killed = contents(store), False
-        count = iter(range(10**6))
-
-        def counted(real, count=count, kill_at=kill_at):
-            def call(*args, **kwargs):
-                if next(count) == kill_at:
-                    raise Killed
-                return real(*args, **kwargs)
-
-            return call
-
-        with pytest.MonkeyPatch.context() as patch:
-            for owner, name in steps:
-                patch.setattr(owner, name, counted(getattr(owner, name)))
-            try:
-                build = repaired(store)
-            except Killed:
-                killed = True
+        damaged, builds = contents(store), list[StoreBuild]()
+        killed = killed_before(kill_at, lambda: builds.append(repaired(store)), steps)  # noqa: B023
         assert contents(store) == damaged
         if killed:
             assert read_plan(part_path(store)) is None, "nothing half begun"
-            build = repaired(store)
+            builds.append(repaired(store))
+        (build,) = builds
         assert build.missing().tolist() == [17]
         build.close()
         if not killed:

@@ -20,6 +20,7 @@ from pipeline.store.chunks import write_seal
 from pipeline.store.merging import merge
 from pipeline.store.schema import ARRAY_NAMES
 from pipeline.store.verification import verify
+from tests.faults.killing import Killed
 
 Make = Callable[..., Path]
 WINDOWS = {"horizon": 3, "sensor_window": 6, "state_window": 5}
@@ -370,10 +371,6 @@ def flip(path: Path, offset: int) -> None:
         byte = file.read(1)
         file.seek(offset)
         file.write(bytes([byte[0] ^ 1]))
-
-
-class Killed(BaseException):
-    """Stands for SIGKILL: nothing may catch it."""
 
 
 @pytest.mark.parametrize("kill_at", [0, 23, 41, 60, 85])

@@ -8,7 +8,6 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -40,6 +39,7 @@ from pipeline.store.paths import (
     set_build_aside,
 )
 from pipeline.store.schema import FEATURES, TRAILER_BYTES, ArraySpec
+from tests.faults.killing import Killed, killed_before
 from tests.store.samples import TEXT, attributes_of, index_of
 
 ROWS = 12
@@ -67,39 +67,6 @@ def resumed(build: StoreBuild) -> StoreBuild:
 
 def rows_of(seed: int, count: int) -> np.ndarray:
     return np.random.default_rng(seed).normal(size=(count, 3, 8)).astype(np.float32)
-
-
-class Killed(BaseException):
-    """Stands for SIGKILL: nothing may catch it."""
-
-
-CHANGES = (
-    *((Path, name) for name in ("rename", "mkdir", "write_text", "unlink", "symlink_to")),
-    (shutil, "rmtree"),
-)
-"""Of a folder."""
-
-
-def killed_before(step: int, act: Callable[[], None], steps=CHANGES) -> bool:
-    """Whether `act` was killed before its n-th of these steps."""
-    count = iter(range(10**6))
-
-    def counted(real):
-        def call(*args, **kwargs):
-            if next(count) == step:
-                raise Killed
-            return real(*args, **kwargs)
-
-        return call
-
-    with pytest.MonkeyPatch.context() as patch:
-        for owner, name in steps:
-            patch.setattr(owner, name, counted(getattr(owner, name)))
-        try:
-            act()
-        except Killed:
-            return True
-    return False
 
 
 class TestCommit:
