@@ -8,7 +8,9 @@ beside.csv (those of the others), settings.json and a page (report.html) into `r
 
   python -m stages.rollout                                     50 episodes at level full
   python -m stages.rollout --set rollout.level=moved           the target is pushed meanwhile
-  python -m stages.rollout --set rollout.chunking=temporal     another way to play chunks
+  python -m stages.rollout --set rollout.chunking=none         another way to play chunks
+  python -m stages.rollout --set 'rollout.latency_ms=[0, 300, 600]'   success against latency
+  python -m stages.rollout --set rollout.head=models/export    what stages.export wrote answers
   python -m stages.rollout --set rollout.server=ws://127.0.0.1:8000   what stages.serve answers
 """
 
@@ -63,6 +65,7 @@ def _here(params: "Params", say: Callable[[str], None]) -> "Rollouts":
     from pipeline.base.device import resolve_device
     from pipeline.evaluate.rollout_driver import roll_out
     from pipeline.policy.checkpoint import find_policy, load_policy
+    from pipeline.robot.export import ExportedHead
     from pipeline.robot.live_features import LiveFeatures
 
     wanted = params.rollout
@@ -70,8 +73,11 @@ def _here(params: "Params", say: Callable[[str], None]) -> "Rollouts":
     checkpoint = load_policy(find_policy(folder))
     device = resolve_device(wanted.device)
     load = partial(LiveFeatures, params.vlm, checkpoint.source["feature_spec"], str(device))
-    say(f"{folder} (step {checkpoint.step}), level {wanted.level}, device {device}")
-    return roll_out(checkpoint, str(folder), checkpoint.policy(device), load, wanted, say)
+    head = wanted.head and ExportedHead(wanted.head, checkpoint)
+    answers = f", {wanted.head} answers" if head else ""
+    say(f"{folder} (step {checkpoint.step}), level {wanted.level}, device {device}{answers}")
+    policy, act = checkpoint.policy(device), head and head.act
+    return roll_out(checkpoint, str(folder), policy, load, wanted, say, act)
 
 
 def _served(wanted: "RolloutParams", say: Callable[[str], None]) -> "Rollouts":

@@ -12,11 +12,13 @@ from typing import Any, Final, Generic, TypeVar
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 from tqdm import tqdm
 
 from pipeline.base.commands import command
 from pipeline.base.config import Level, RolloutAblation, RolloutParams
 from pipeline.base.errors import CheckpointMismatch, ConfigError
+from pipeline.base.observation import Observation
 from pipeline.evaluate.rollouts import (
     EXPERT,
     POLICY,
@@ -24,8 +26,10 @@ from pipeline.evaluate.rollouts import (
     Rollouts,
     SuccessRate,
     controller_name,
+    late_name,
 )
 from pipeline.policy.checkpoint import PolicyCheckpoint
+from pipeline.policy.expert import Generators, Guide
 from pipeline.policy.observation import moving_channels, stream_of
 from pipeline.policy.policy import Policy
 from pipeline.robot.chunking import Executor, check_chunking
@@ -42,6 +46,10 @@ from pipeline.simulation.rendering import VIEWS, photograph
 SIDE_BY_SIDE: Final = 50
 """Environments that are stepped together and share passes of a model in this process."""
 
+Act = Callable[[Observation, Generators, Guide | None], Tensor]
+"""Answers observations with chunks (robot, horizon, action), as `Policy.act`."""
+Seen = TypeVar("Seen")
+"""What a pass of the model gives a robot."""
 Chunk = NDArray[np.float32]
 Readings = Mapping[str, NDArray[Any]]
 
@@ -53,20 +61,21 @@ def roll_out(
     load_features: Callable[[], LiveFeatures],
     wanted: RolloutParams,
     say: Callable[[str], None] = lambda line: None,
+    act: Act | None = None,
 ) -> Rollouts:
-    """Episodes of the policy, of the policy with a stream ablated, and of the demonstrator.
+    """Episodes of the policy, late and with a stream ablated, and of the demonstrator.
 
-    `say` prints a line for each controller whose episodes have ended. `load_features` is called
-    where the policy looks at features, after everything else was checked; the model proves that it
-    gives the policy's features before the first episode (`prove`). Raises `CheckpointMismatch`
-    where the phantom lacks what the policy was trained on, and `ConfigError` for an instruction
-    that the policy was not trained on, for chunking that its expert cannot do and for more steps
-    than a chunk has.
+    `act` answers in place of the policy's own: its exported head. `say` prints a line for each
+    controller whose episodes have ended. `load_features` is called where the policy looks at
+    features, after everything else was checked; the model proves that it gives the policy's
+    features before the first episode (`prove`). Raises `CheckpointMismatch` where the phantom lacks
+    what the policy was trained on, and `ConfigError` for an instruction that the policy was not
+    trained on, for chunking that its expert cannot do and for more steps than a chunk has.
     """
     shape = checkpoint.shape
     widths = {"action": shape.action_dim, "state": shape.state_dim, "sensor": shape.sensor_channels}
     _refuse_other_robot(checkpoint.source, widths)
-    check_chunking(wanted.chunking, policy.stochastic)
+    check_chunking(wanted.chunking, policy.stochastic and act is None)
     Executor(wanted.chunking, wanted.execute, policy.params.horizon)
     features = load_features() if "features" in policy.encoders else None
     if features is not None:
@@ -80,8 +89,8 @@ def roll_out(
     ]
     settings = {"checkpoint": name, "step": checkpoint.step}
     settings |= {"model_type": policy.params.model_type, "instruction": instruction}
-    driver = _LocalDriver(checkpoint, policy, features, wanted, instruction)
-    return _run_episodes(driver, checkpoint.source, [None, *ablations], wanted, settings, say)
+    driver = _LocalDriver(checkpoint, policy, features, wanted, instruction, act or policy.act)
+    return _run_episodes(driver, checkpoint.source, ablations, wanted, settings, say)
 
 
 def roll_out_served(
@@ -89,15 +98,10 @@ def roll_out_served(
 ) -> Rollouts:
     """Episodes of a served policy, one after another, and of the demonstrator.
 
-    The simulation waits for each answer: with `rollout.execute` 1 a policy does what it does in
-    `roll_out` without latency, bit for bit where both compute one row at a time on one thread.
-    No stream is ablated. Raises as `roll_out`, and `ConfigError` for a simulated latency.
+    The simulation waits for each answer, and holds frames back for a simulated latency: with
+    `rollout.execute` 1 a policy does what it does in `roll_out`, bit for bit where both compute one
+    row at a time on one thread. No stream is ablated. Raises as `roll_out`.
     """
-    if wanted.latency_ms:
-        raise ConfigError(
-            "rollout.latency_ms: expected 0 with rollout.server, whose answers are waited for, "
-            f"found {wanted.latency_ms:g}. Roll out without rollout.server to simulate it."
-        )
     metadata = server.metadata
     streams = {name: metadata["streams"].get(name) for name in ("action", "state", "sensor")}
     widths = {name: len(stream["names"]) if stream else 0 for name, stream in streams.items()}
@@ -107,7 +111,7 @@ def roll_out_served(
     settings = {name: metadata[name] for name in ("checkpoint", "step", "model_type")}
     settings["instruction"] = instruction
     driver = _ServedDriver(server, wanted, instruction)
-    return _run_episodes(driver, metadata, [None], wanted, settings, say)
+    return _run_episodes(driver, metadata, (), wanted, settings, say)
 
 
 def _refuse_other_robot(source: Mapping[str, Any], widths: Mapping[str, int]) -> None:
@@ -150,12 +154,12 @@ def _instruction_of(trained: Sequence[str]) -> str:
 def _run_episodes(
     driver: "_Driver[Any]",
     source: Mapping[str, Any],
-    ablations: Sequence[RolloutAblation | None],
+    ablations: Sequence[RolloutAblation],
     wanted: RolloutParams,
     settings: Mapping[str, Any],
     say: Callable[[str], None],
 ) -> Rollouts:
-    """Episodes of the policy under each of `ablations`, None for none, and of the demonstrator.
+    """Episodes of the policy, with each latency and then ablation, and of the demonstrator.
 
     `source` is what the policy was trained on; `settings` describe it, its `checkpoint` among them.
     """
@@ -163,14 +167,18 @@ def _run_episodes(
     side_by_side = driver.side_by_side
     groups = [seeds[at : at + side_by_side] for at in range(0, len(seeds), side_by_side)]
     episodes: list[RolloutEpisode] = []
-    total = (1 + len(ablations)) * len(seeds)
-    with tqdm(total=total, unit="episode", disable=None) as bar:
-        for ablation in ablations:
-            controller = ablation or POLICY
+    first_ms, *others_ms = wanted.latencies_ms
+    ways: list[tuple[str, float, RolloutAblation | None]] = [
+        (POLICY, first_ms, None),
+        *((late_name(latency_ms), latency_ms, None) for latency_ms in others_ms),
+        *((ablation, first_ms, ablation) for ablation in ablations),
+    ]
+    with tqdm(total=(1 + len(ways)) * len(seeds), unit="episode", disable=None) as bar:
+        for controller, latency_ms, ablation in ways:
             bar.set_description(controller)
             for group in groups:
                 environments = [_begin_episode(source, wanted.level, seed) for seed in group]
-                stops = driver.drive(environments, ablation, bar.update)
+                stops = driver.drive(environments, latency_ms / 1000, ablation, bar.update)
                 episodes += [
                     _episode(controller, wanted.level, environment.insertion, stop)
                     for environment, stop in zip(environments, stops, strict=True)
@@ -220,16 +228,44 @@ def _episode(
 
 
 @dataclass
-class _Robot(ABC):
+class _Robot(ABC, Generic[Seen]):
     """One environment with its control loop, and why it stopped safely."""
 
     environment: InsertionEnvironment
     loop: ControlLoop
+    latency_s: float
+    """What a pass of the model takes."""
     stop: str | None = field(default=None, init=False)
+    time_s: float = field(default=0.0, init=False)
+    under_way: tuple[float, Seen] | None = field(default=None, init=False)
+    """When the model's pass that has begun ends, and what it gives."""
 
-    @abstractmethod
     def sense(self, readings: Readings) -> None:
         """Begin a tick with what was read since the last."""
+        self.loop.begin_tick()
+        self.time_s = float(readings["time"][0])
+        self.remember(readings)
+        self._end_pass()
+
+    def see(self, seen: Seen) -> None:
+        """Begin a pass of the model, whose answer is there `latency_s` from now."""
+        self.loop.pass_began()
+        self.under_way = self.time_s + self.latency_s, seen
+        self._end_pass()
+
+    def _end_pass(self) -> None:
+        if self.under_way is not None and self.time_s >= self.under_way[0] - 1e-9:
+            self.take(self.under_way[1])
+            self.under_way = None
+            self.loop.pass_ended()
+
+    @abstractmethod
+    def remember(self, readings: Readings) -> None:
+        """Keep these readings for the next observation."""
+
+    @abstractmethod
+    def take(self, seen: Seen) -> None:
+        """Keep what a pass gives for the next observation."""
 
     def plan(self, chunk: Chunk) -> None:
         """Take the chunk that was asked for; one that is not all numbers stops the robot."""
@@ -250,7 +286,7 @@ class _Robot(ABC):
         return self.stop is None and not self.environment.insertion.finished
 
 
-AnyRobot = TypeVar("AnyRobot", bound=_Robot)
+AnyRobot = TypeVar("AnyRobot", bound=_Robot[Any])
 
 
 class _Driver(ABC, Generic[AnyRobot]):
@@ -262,11 +298,15 @@ class _Driver(ABC, Generic[AnyRobot]):
     def drive(
         self,
         environments: Sequence[InsertionEnvironment],
+        latency_s: float,
         ablation: RolloutAblation | None,
         ended: Callable[[], Any],
     ) -> list[str | None]:
-        """Why each robot stopped safely, or None; `ended` is called for each that ends."""
-        robots = [self.begin(environment) for environment in environments]
+        """Why each robot stopped safely, or None; `ended` is called for each that ends.
+
+        A pass of the model takes `latency_s`.
+        """
+        robots = [self.begin(environment, latency_s) for environment in environments]
         for robot in robots:
             robot.sense(robot.environment.readings())
         active = robots
@@ -283,7 +323,7 @@ class _Driver(ABC, Generic[AnyRobot]):
         return [robot.stop for robot in robots]
 
     @abstractmethod
-    def begin(self, environment: InsertionEnvironment) -> AnyRobot:
+    def begin(self, environment: InsertionEnvironment, latency_s: float) -> AnyRobot:
         """The robot of an environment whose episode begins."""
 
     @abstractmethod
@@ -294,32 +334,21 @@ class _Driver(ABC, Generic[AnyRobot]):
 
 
 @dataclass
-class _LocalRobot(_Robot):
+class _LocalRobot(_Robot[SeenFeatures]):
     """A robot whose memory is here; its noise comes from a generator of its own."""
 
     memory: RobotMemory
     generator: torch.Generator
-    under_way: tuple[float, SeenFeatures] | None = None
-    """When the model's pass that has begun ends, and what it gives."""
     first: dict[str, NDArray[Any]] = field(default_factory=dict[str, NDArray[Any]])
     """What a frozen stream was first."""
 
-    def sense(self, readings: Readings) -> None:
-        """Begin a tick; features whose pass has ended by now become the newest."""
-        self.loop.begin_tick()
+    def remember(self, readings: Readings) -> None:
+        """Keep them in the memory."""
         self.memory.sense(readings)
-        self._take_features()
 
-    def see(self, seen: SeenFeatures, latency_s: float) -> None:
-        """Begin a pass of the model, whose answer is there `latency_s` from now."""
-        self.loop.pass_began()
-        self.under_way = self.memory.time_s + latency_s, seen
-        self._take_features()
-
-    def _take_features(self) -> None:
-        if self.under_way is not None and self.memory.time_s >= self.under_way[0] - 1e-9:
-            self.memory.features, self.under_way = self.under_way[1], None
-            self.loop.pass_ended()
+    def take(self, seen: SeenFeatures) -> None:
+        """Make these features the newest."""
+        self.memory.features = seen
 
 
 @dataclass(frozen=True)
@@ -335,15 +364,16 @@ class _LocalDriver(_Driver[_LocalRobot]):
     features: LiveFeatures | None
     wanted: RolloutParams
     instruction: str
+    act: Act
 
-    def begin(self, environment: InsertionEnvironment) -> _LocalRobot:
+    def begin(self, environment: InsertionEnvironment, latency_s: float) -> _LocalRobot:
         """The loop and the memory of a robot."""
         wanted, source = self.wanted, self.checkpoint.source
         moving = moving_channels(source["streams"]["action"])
         executor = Executor(wanted.chunking, wanted.execute, self.policy.params.horizon, moving)
         loop = ControlLoop(executor, source["vlm_reuse_count"], self.features is not None)
         generator = torch.Generator().manual_seed(environment.insertion.layout.seed)
-        return _LocalRobot(environment, loop, RobotMemory.of(self.policy), generator)
+        return _LocalRobot(environment, loop, latency_s, RobotMemory.of(self.policy), generator)
 
     def chunks(
         self, active: Sequence[_LocalRobot], ablation: RolloutAblation | None
@@ -368,7 +398,7 @@ class _LocalDriver(_Driver[_LocalRobot]):
         rows = zip(features.numpy(), valid.numpy(), strict=True)
         for robot, views, (row, real) in zip(due, taken, rows, strict=True):
             times = np.array([time for time, _ in views.values()])
-            robot.see(SeenFeatures(row, real, times), self.wanted.latency_ms / 1000)
+            robot.see(SeenFeatures(row, real, times))
 
     def _act(self, due: Sequence[_LocalRobot], ablation: RolloutAblation | None) -> Chunk:
         """The chunks (robot, horizon, action).
@@ -392,20 +422,27 @@ class _LocalDriver(_Driver[_LocalRobot]):
         observation = self.policy.observe(streams)
         guide = stack_guides(guides, observation.features.device)
         generators = [robot.generator for robot in due]
-        return self.policy.act(observation, generators, guide).cpu().numpy()
+        return self.act(observation, generators, guide).cpu().numpy()
 
 
 @dataclass
-class _ServedRobot(_Robot):
-    """A robot whose memory is the server's."""
+class _ServedRobot(_Robot[Mapping[str, Any]]):
+    """A robot whose memory is the server's, which gets frames as late as the model is."""
 
+    sees: bool
+    """Whether the server has frames of this episode, or needs none."""
     unsent: list[Readings] = field(default_factory=list[Readings])
     """The readings of each tick since the last observation."""
+    frames: Mapping[str, Any] = field(default_factory=dict[str, Any])
+    """The newest frames that are not sent yet, with their times."""
 
-    def sense(self, readings: Readings) -> None:
-        """Begin a tick; its readings go out with the next observation."""
-        self.loop.begin_tick()
+    def remember(self, readings: Readings) -> None:
+        """They go out with the next observation."""
         self.unsent.append(readings)
+
+    def take(self, seen: Mapping[str, Any]) -> None:
+        """They go out with the next observation."""
+        self.frames, self.sees = seen, True
 
 
 @dataclass(frozen=True)
@@ -417,7 +454,7 @@ class _ServedDriver(_Driver[_ServedRobot]):
     wanted: RolloutParams
     instruction: str
 
-    def begin(self, environment: InsertionEnvironment) -> _ServedRobot:
+    def begin(self, environment: InsertionEnvironment, latency_s: float) -> _ServedRobot:
         """The loop of a robot; the server begins anew with its first observation."""
         wanted, metadata = self.wanted, self.server.metadata
         executor = Executor(
@@ -425,14 +462,26 @@ class _ServedDriver(_Driver[_ServedRobot]):
         )
         loop = ControlLoop(executor, metadata["vlm_reuse_count"], metadata["uses_features"])
         self.server.reset(environment.insertion.layout.seed)
-        return _ServedRobot(environment, loop)
+        return _ServedRobot(environment, loop, latency_s, sees=not metadata["uses_features"])
 
     def chunks(
         self, active: Sequence[_ServedRobot], ablation: RolloutAblation | None
     ) -> Iterable[tuple[_ServedRobot, Chunk]]:
         """The server's answers, each waited for."""
         assert ablation is None, "a served policy sees what there is"
-        return [(robot, self._ask(robot)) for robot in active if robot.loop.chunk_due]
+        for robot in active:
+            if robot.loop.frames_due:
+                self._photograph(robot)
+        asking = [robot for robot in active if robot.sees and robot.loop.chunk_due]
+        return [(robot, self._ask(robot)) for robot in asking]
+
+    def _photograph(self, robot: _ServedRobot) -> None:
+        fields: dict[str, Any] = {}
+        taken = robot.environment.frames()
+        for view in self.server.metadata["streams"]["views"]:
+            time_s, frame = taken[view]
+            fields |= {f"images/{view}": frame, f"images_time/{view}": time_s}
+        robot.see(fields)
 
     def _ask(self, robot: _ServedRobot) -> Chunk:
         guide = robot.loop.ask()
@@ -440,15 +489,9 @@ class _ServedDriver(_Driver[_ServedRobot]):
             name: np.concatenate([tick[name] for tick in robot.unsent]) for name in robot.unsent[0]
         }
         observation |= {"time": robot.unsent[-1]["time"], "prompt": self.instruction}
+        observation |= robot.frames
         if guide is not None:
             observation |= {"guide/chunk": guide.chunk, "guide/weight": guide.weight}
-        if robot.loop.frames_due:
-            robot.loop.pass_began()
-            frames = robot.environment.frames()
-            for view in self.server.metadata["streams"]["views"]:
-                time_s, frame = frames[view]
-                observation |= {f"images/{view}": frame, f"images_time/{view}": time_s}
         answer = self.server.infer(observation)
-        robot.loop.pass_ended()
-        robot.unsent = []
+        robot.unsent, robot.frames = [], {}
         return answer["actions"]

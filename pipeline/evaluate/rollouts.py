@@ -20,6 +20,11 @@ POLICY: Final = "policy"
 EXPERT: Final = "expert"
 
 
+def late_name(latency_ms: float) -> str:
+    """The controller that is the policy with a model so late."""
+    return f"{latency_ms:g} ms late"
+
+
 def controller_name(controller: str) -> str:
     """What people read of a controller."""
     known = {POLICY: "policy", EXPERT: "demonstrator"}
@@ -100,6 +105,13 @@ class Rollouts:
             name: SuccessRate.of([e.success for e in self.of(name)]) for name in self.controllers
         }
 
+    def by_latency(self) -> dict[float, SuccessRate]:
+        """The policy's success by what a pass of the model takes, ms, in rising order."""
+        rates, given = self.rates(), self.settings["latency_ms"]
+        first, *others = dict.fromkeys(given if isinstance(given, Sequence) else (given,))
+        names = {first: POLICY} | {latency_ms: late_name(latency_ms) for latency_ms in others}
+        return {latency_ms: rates[names[latency_ms]] for latency_ms in sorted(names)}
+
     def summary(self) -> Table:
         """A row a controller: its success, and where its episodes ended."""
         rows: list[tuple[Any, ...]] = []
@@ -120,7 +132,8 @@ class Rollouts:
     def document(self) -> dict[str, Any]:
         """The content of metrics.json."""
         success = {name: vars(rate) for name, rate in self.rates().items()}
-        return {"success": success, "levels": {self.level: success}}
+        late = {f"{latency_ms:g}": vars(rate) for latency_ms, rate in self.by_latency().items()}
+        return {"success": success, "levels": {self.level: success}, "latency_ms": late}
 
     def table(self, policy: bool) -> Table:
         """A row an episode: those of the policy, or those beside it with who controlled them."""

@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from pipeline.evaluate.rollouts import RolloutEpisode, Rollouts, controller_name
+from pipeline.evaluate.rollouts import RolloutEpisode, Rollouts, SuccessRate, controller_name
 from pipeline.look.page.blocks import Block, Outline, Picture, Report, Section, Text
 from pipeline.look.page.style import INK, PALETTE, canvas, draw_strip, finish, panels
 from pipeline.look.page.writing import sentence
@@ -65,11 +65,31 @@ def rollout_report(rollouts: Rollouts) -> Report:
         tiles=[("success of the policy", str(rates["policy"]))],
         sections=(
             Section("Success", [Text(_SUCCESS), Text(_CONTROLLERS), rollouts.summary()]),
+            *_lateness(rollouts),
             Section("Where the needle went", _paths_and_courses(rollouts)),
             Section("Episodes closely", (), tuple(_filmstrips(episodes))),
             Section("What was run", [Outline("Settings of the rollout", rollouts.settings)]),
         ),
     )
+
+
+def _lateness(rollouts: Rollouts) -> Iterator[Section]:
+    """Success against latency, where there are several."""
+    rates = rollouts.by_latency()
+    if len(rates) > 1:
+        words = "The same episodes with a model that takes longer for a pass. Bars are 95 %."
+        picture = Picture("latency", words, partial(draw_latency, rates))
+        yield Section("A late model", [picture])
+
+
+def draw_latency(rates: Mapping[float, SuccessRate]) -> Figure:
+    """The success of the policy against what a pass of the model takes."""
+    figure, axis = panels(_WIDTH, 3.6, 1, 1)
+    centre, low, high = 100 * np.array([(r.rate, r.low, r.high) for r in rates.values()]).T
+    bars = np.stack([centre - low, high - centre])
+    axis.errorbar([*rates], centre, np.maximum(bars, 0), fmt="o-", capsize=3, color=PALETTE[0])
+    axis.set(xlabel="a pass of the model takes [ms]", ylabel="inserted [%]", ylim=(-2, 102))
+    return figure
 
 
 def worst_and_median(episodes: Sequence[RolloutEpisode]) -> tuple[RolloutEpisode, RolloutEpisode]:

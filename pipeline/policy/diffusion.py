@@ -19,6 +19,7 @@ from pipeline.policy.expert import (
     StepMask,
     gain,
     pull,
+    repeated,
     standard_normal,
     uniform,
 )
@@ -44,6 +45,7 @@ class DiffusionActionExpert(ActionExpert):
         layers: int = 4,
         heads: int = 8,
         dropout: float = 0.1,
+        draws: int = 1,
         timesteps: int = 100,
         schedule: ScheduleKind = "cosine",
         prediction: Prediction = "epsilon",
@@ -56,6 +58,7 @@ class DiffusionActionExpert(ActionExpert):
     ) -> None:
         super().__init__(horizon, action_dim, groups, group_weights, "mse")
         self.prediction: Prediction = prediction
+        self.draws = draws
         self.sampler, self.eta, self.clip = sampler, eta, clip
         self.schedule = NoiseSchedule(timesteps, schedule)
         self.steps = self.schedule.steps(timesteps if sampler == "ddpm" else sampling_steps)
@@ -67,7 +70,8 @@ class DiffusionActionExpert(ActionExpert):
     def loss(
         self, context: Context, actions: Chunk, valid: StepMask, generator: Generator | None = None
     ) -> Losses:
-        """The grouped squared error of the prediction at a uniform step of the schedule."""
+        """The grouped squared error of the prediction at uniform steps, `draws` a chunk."""
+        context, actions, valid = repeated(self.draws, context, actions, valid)
         sample = actions.float().masked_fill(~valid.unsqueeze(-1), 0.0)
         epsilon = standard_normal(sample.shape, sample.device, generator)
         drawn = uniform(len(sample), sample.device, generator)

@@ -151,6 +151,11 @@ class GroupedLoss(nn.Module):
         return (means * self.weights).sum(), parts
 
 
+def repeated(times: int, *batch: Tensor) -> tuple[Tensor, ...]:
+    """The tensors of a batch, each repeated as a whole along its first axis."""
+    return tuple(x.repeat(times, *[1] * (x.ndim - 1)) for x in batch)
+
+
 def standard_normal(
     shape: Sequence[int], device: torch.device, generator: Generators
 ) -> Float[Tensor, "..."]:

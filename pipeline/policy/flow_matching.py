@@ -18,6 +18,7 @@ from pipeline.policy.expert import (
     StepMask,
     gain,
     pull,
+    repeated,
     standard_normal,
     uniform,
 )
@@ -93,6 +94,7 @@ class FlowMatchingActionExpert(ActionExpert):
         layers: int = 4,
         heads: int = 8,
         dropout: float = 0.1,
+        draws: int = 1,
         sampling_steps: int = 10,
         solver: Solver = "euler",
         time: Literal["uniform", "beta"] = "uniform",
@@ -102,7 +104,7 @@ class FlowMatchingActionExpert(ActionExpert):
         group_weights: Mapping[str, float] | None = None,
     ) -> None:
         super().__init__(horizon, action_dim, groups, group_weights, "mse")
-        self.sampling_steps = sampling_steps
+        self.draws, self.sampling_steps = draws, sampling_steps
         self.solver: Solver = solver
         self.times = BetaTimes(alpha, beta) if time == "beta" else nn.Identity()
         self.denoiser = Denoiser(
@@ -113,7 +115,8 @@ class FlowMatchingActionExpert(ActionExpert):
     def loss(
         self, context: Context, actions: Chunk, valid: StepMask, generator: Generator | None = None
     ) -> Losses:
-        """The grouped squared error of the velocity at a drawn time."""
+        """The grouped squared error of the velocity at drawn times, `draws` a chunk."""
+        context, actions, valid = repeated(self.draws, context, actions, valid)
         chunk = actions.float().masked_fill(~valid.unsqueeze(-1), 0.0)
         noise = standard_normal(chunk.shape, chunk.device, generator)
         time = self.times(uniform(len(chunk), chunk.device, generator))

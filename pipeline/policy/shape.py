@@ -66,8 +66,7 @@ def find_anchors(
     vector `rx`, `ry`, `rz`, which is anchored whole, by the angles of the arm's pose. Raises
     `ConfigError` naming a channel that is no such delta.
     """
-    deltas = zip(action["names"], action["units"], strict=True) if action["kind"] == "delta" else ()
-    told = {name: place for name, unit in deltas if (place := _told(name, unit, state)) is not None}
+    told = told_deltas(action, state)
     whole = {*_ROTVEC} <= {*wanted} & {*action["names"]} and {*_POSE_ANGLES} <= {*state["names"]}
     composed = _ROTVEC if whole and action["kind"] == "delta" else ()
     if unknown := [name for name in wanted if name not in {*told, *composed}]:
@@ -80,6 +79,12 @@ def find_anchors(
         places = [(action, _ROTVEC), (state, _POSE_ANGLES)]
         anchors.append(Anchor(*(tuple(map(s["names"].index, n)) for s, n in places), composed=True))
     return tuple(anchors)
+
+
+def told_deltas(action: Mapping[str, Any], state: Mapping[str, Any]) -> dict[str, int]:
+    """The delta channels of the action that are anchored alone, and the state's channel of each."""
+    deltas = zip(action["names"], action["units"], strict=True) if action["kind"] == "delta" else ()
+    return {name: place for name, unit in deltas if (place := _told(name, unit, state)) is not None}
 
 
 def _told(name: str, unit: str, state: Mapping[str, Any]) -> int | None:

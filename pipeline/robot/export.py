@@ -25,15 +25,16 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.export import Dim, ExportedProgram
 
+from pipeline.base.commands import command
 from pipeline.base.config import ExportParams
-from pipeline.base.errors import ConfigError, NumericsError
+from pipeline.base.errors import CheckpointMismatch, ConfigError, NumericsError
 from pipeline.base.files import OutputKind, replace_folder, sha256_of, write_document
 from pipeline.base.observation import Observation
 from pipeline.policy.checkpoint import PolicyCheckpoint
-from pipeline.policy.expert import Chunk
+from pipeline.policy.expert import Chunk, Generators, Guide, standard_normal
 from pipeline.policy.observation import AGES
 from pipeline.policy.policy import Policy
-from pipeline.robot.export_inputs import Inputs, chunk_size, golden_inputs
+from pipeline.robot.export_inputs import ROWS, Inputs, chunk_size, golden_inputs, random_inputs
 
 RECEIPT, CONTRACT = "receipt.json", "contract.json"
 EXPORT = OutputKind("an exported head", lambda folder: (folder / RECEIPT).is_file())
@@ -202,10 +203,51 @@ def onnx_session(path: Path, threads: int = 0) -> Any:
     return runtime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
 
 
-def onnx_runner(path: Path) -> Runner:
+def onnx_runner(path: Path, threads: int = 0) -> Runner:
     """Runs an ONNX file."""
-    session = onnx_session(path)
+    session = onnx_session(path, threads)
     return lambda given: session.run(None, {name: v.numpy() for name, v in given.items()})[0]
+
+
+class ExportedHead:
+    """The head.onnx of an export on one thread of the CPU, with the interface of `Policy.act`.
+
+    Raises `CheckpointMismatch` for a folder without the file, and for a file that answers otherwise
+    than the policy of `checkpoint`.
+    """
+
+    def __init__(self, folder: Path, checkpoint: PolicyCheckpoint) -> None:
+        path = folder / "head.onnx"
+        if not path.is_file():
+            raise CheckpointMismatch(
+                f"{path}: expected the head of this checkpoint, found no such file. Run "
+                f"{command('export')} with onnx among export.formats."
+            )
+        policy = checkpoint.policy()
+        given = random_inputs(checkpoint, policy, ROWS)
+        self._run, self._names = onnx_runner(path, threads=1), [*given]
+        self._draws = given["noise"].shape[1] if "noise" in given else 0
+        self._size = chunk_size(checkpoint)
+        try:
+            off = _furthest(self._run, Head(policy).eval(), given, checkpoint)[1]
+        except Exception as error:  # the classes of ONNX Runtime's errors are its own
+            off = f"{type(error).__name__}: {error}"
+        if isinstance(off, str) or not off <= TOLERANCE:
+            raise CheckpointMismatch(
+                f"{path}: expected answers within {TOLERANCE:g} training std of the checkpoint's, "
+                f"found {off}. It is the head of another checkpoint: run {command('export')} again."
+            )
+
+    def act(
+        self, observation: Observation, generator: Generators = None, guide: Guide | None = None
+    ) -> Chunk:
+        """Chunks in physical units; `generator` draws what it draws for the policy."""
+        assert guide is None, "the exported head takes no guide"
+        shape = (len(observation.features), *self._size)
+        draws = [standard_normal(shape, torch.device("cpu"), generator) for _ in range(self._draws)]
+        noise = {"noise": torch.stack(draws, 1)} if draws else {}
+        seen = {name: getattr(observation, name) for name in self._names if name != "noise"}
+        return torch.from_numpy(self._run({n: v.cpu() for n, v in (seen | noise).items()}))
 
 
 def torch_runner(path: Path) -> Runner:
@@ -221,8 +263,7 @@ def _compare(
     """The receipt of a file. Raises `NumericsError` where it is too far from the policy."""
     off: dict[str, dict[str, Any]] = {}
     for name, inputs in given.items():
-        furthest = np.abs(run(inputs) - head(**inputs).numpy().astype(np.float64)).max(axis=(0, 1))
-        std = float((furthest / checkpoint.normalization.action.scale).max())
+        furthest, std = _furthest(run, head, inputs, checkpoint)
         off[name] = {"std": std, "physical": furthest.tolist()}
         if not std <= TOLERANCE:  # a NaN is too far, too
             raise NumericsError(
@@ -237,6 +278,14 @@ def _compare(
         "tolerance_std": TOLERANCE,
         "deviation": off,
     }
+
+
+def _furthest(
+    run: Runner, head: Head, given: Inputs, checkpoint: PolicyCheckpoint
+) -> tuple[NDArray[np.float64], float]:
+    """How far a file is off the policy at most, by channel, and in training std."""
+    furthest = np.abs(run(given) - head(**given).numpy().astype(np.float64)).max(axis=(0, 1))
+    return furthest, float((furthest / checkpoint.normalization.action.scale).max())
 
 
 @contextmanager

@@ -17,7 +17,7 @@ from pipeline.policy.policy import Policy
 Inputs = dict[str, Tensor]
 """Tensors of the fields of `Observation` that a policy looks at, in their order, and `noise`."""
 
-_ROWS = 16
+ROWS = 16
 _OLD_S = 30.0
 """Age of the oldest features among the random inputs."""
 _TURN = {"deg": 5.0, "rad": 0.1, "rotation": 5.0}
@@ -26,7 +26,7 @@ _TURN = {"deg": 5.0, "rad": 0.1, "rotation": 5.0}
 
 def golden_inputs(checkpoint: PolicyCheckpoint, policy: Policy) -> dict[str, Inputs]:
     """`random` inputs and, where the checkpoint has golden rows, `golden` ones."""
-    given = {"random": random_inputs(checkpoint, policy, _ROWS)}
+    given = {"random": random_inputs(checkpoint, policy, ROWS)}
     rows = checkpoint.golden
     if rows and "features" in policy.encoders:
         golden = random_inputs(checkpoint, policy, len(rows), seed=1)

@@ -92,7 +92,7 @@ class RunSettings:
     hz: float | None = None
     """Ticks a second; the policy's `action_hz` where None."""
     execute: int = 1
-    chunking: Chunking = "none"
+    chunking: Chunking = "temporal"
     seconds: float | None = None
     """How long; None: until something ends it."""
     seed: int | None = None
@@ -185,6 +185,7 @@ class _Run:
                 f"limits: expected hz={self.hz:g}, the actions that the loop sends a second, found "
                 f"{limits.hz:g}. Make the limits with hz={self.hz:g}."
             )
+        self.trained_age_s = float(meta.get("trained_age_s", math.inf))
         self.chunk_shape = (meta["horizon"], meta["action_dim"])
         self.views = tuple(meta["streams"]["views"]) if meta["uses_features"] else ()
         moving = tuple(meta["moving"])
@@ -311,6 +312,7 @@ class _Run:
             self.timer.mark("plan")
         if answer.get("feature_age_s") is not None:
             self.features_s = self.asked_s - float(answer["feature_age_s"])
+            self.report.old_features += answer["feature_age_s"] > self.trained_age_s
             if self.features_s >= self.frames_s - 1e-3:
                 self.loop.pass_ended()
         chunk = np.asarray(answer["actions"], np.float32)

@@ -122,6 +122,8 @@ class RunReport:
         """Questions that the policy's server was too busy to answer; it took their readings."""
         self.dropped_readings = 0
         """Readings that came between two questions and are older than a policy's window holds."""
+        self.old_features = 0
+        """Answers from features that were older than the policy was trained for."""
         self.clipped = 0
         """Ticks in which limits let less through than was wanted."""
         self.clock_offset_s = math.nan

@@ -132,6 +132,16 @@ class ServedPolicy:
             self._say(f"warning: the policy was never trained on {prompt!r:.200}, but on {known}")
         return prompt
 
+    def warn_of_age(self, age_s: float) -> None:
+        """Warn once of features that are older than training knows them, beyond clocks' noise."""
+        if age_s > 1.1 * self.metadata["trained_age_s"] and "" not in self._told:
+            self._told.add("")
+            self._say(
+                f"warning: features are {age_s:.2f} s old, and the policy was trained on at most "
+                f"{self.metadata['trained_age_s']:.2f} s: expect worse actions. Train with "
+                "train_head.anchor, or use a faster model."
+            )
+
     def _pass(self, waiting: WaitingFrames) -> Pass:
         assert self._features is not None
         (observation, instruction), began = waiting.pop(), perf_counter()
@@ -160,6 +170,9 @@ class ServedPolicy:
             "instructions": list(self.checkpoint.instructions),
             "sensor_window": params.sensor_window,
             "state_window": params.state_readings,
+            "trained_age_s": params.trained_age_s(
+                source["vlm_reuse_count"] / (source["action_hz"] or np.inf)
+            ),
             "checkpoint": self._name,
             "step": self.checkpoint.step,
         }
@@ -184,8 +197,9 @@ class Session:
     def infer(self, observation: Mapping[str, Any]) -> Answer:
         """The answer to an observation: `actions` (horizon, action) in the units of the metadata.
 
-        It also has `server_timing` in ms and, where the policy looks at features, `feature_age_s`
-        and `feature_key` (16,). Raises `ObservationError`, `NumericsError` and `VLMError`.
+        It also has `server_timing` in ms and, where the policy looks at features, `feature_age_s`,
+        `trained_age_s`, up to which training knows features, and `feature_key` (16,). Raises
+        `ObservationError`, `NumericsError` and `VLMError`.
         """
         return self.answer(self.take(observation))
 
@@ -212,8 +226,10 @@ class Session:
         timing = {part: 1000 * seconds for part, seconds in spent.items()}
         answer: Answer = {"actions": actions, "server_timing": timing}
         if (seen := self._memory.features) is not None:
-            key = np.frombuffer(seen.key, np.uint8)
-            answer |= {"feature_age_s": float(fields["feature_age"]), "feature_key": key}
+            key, age_s = np.frombuffer(seen.key, np.uint8), float(fields["feature_age"])
+            trained_s = self.metadata["trained_age_s"]
+            answer |= {"feature_age_s": age_s, "trained_age_s": trained_s, "feature_key": key}
+            self._served.warn_of_age(age_s)
         return answer
 
     def _begin_episode(self) -> None:

@@ -42,7 +42,7 @@ from pipeline.train.run import TrainingRun, policy_shape
 from pipeline.train.sampling import Plan, StepPart
 from pipeline.train.scores import action_space, compare
 from pipeline.train.split import Split
-from pipeline.train.statistics import fit_normalization
+from pipeline.train.statistics import fit_normalization, resolve_anchor
 from pipeline.train.training_data import source_of, split_parts
 
 LOG_EVERY = 10
@@ -68,6 +68,7 @@ class Trainer:
         run: TrainingRun,
         source: FeatureSource | None = None,
     ) -> None:
+        params = resolve_anchor(store, split.train, params)
         self.store, self.params, self.split, self.run = store, params, split, run
         self.processes = ProcessGroup.current()
         self.device = process_device(params.device)
@@ -98,7 +99,7 @@ class Trainer:
         else:
             fitted = partial(fit_normalization, store, split.train, self.windows)
             self.normalization = self.processes.shared(fitted)
-            self.shape = policy_shape(store, self.normalization, params.anchor)
+            self.shape = policy_shape(store, self.normalization, tuple(params.anchor))
             self._build()
 
     def _build(self) -> None:

@@ -13,16 +13,19 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from pipeline.base.arrays import first_non_finite, widen
-from pipeline.base.channels import usual_spread
+from pipeline.base.channels import action_groups, usual_spread
+from pipeline.base.config import TrainHeadParams
 from pipeline.base.errors import NumericsError
 from pipeline.policy.attention import right_aligned
 from pipeline.policy.normalization import Block, ChannelStatistics, Normalization, fit_channels
-from pipeline.policy.shape import channel_kinds, expanded_names
+from pipeline.policy.shape import channel_kinds, expanded_names, told_deltas
 from pipeline.policy.state_channels import expand
 from pipeline.store import FeatureStore, place
 from pipeline.train.batches import Ticks, Windows, evenly
 
 CHUNK_BYTES = 64 * 2**20
+ONE_WAY = 0.5
+"""Mean over root mean square of the episodes' net motions from which they advance the same way."""
 _STATE_TICKS = 16_384
 """Training ticks at most whose windows give the statistics of the states."""
 _AT_ONCE = 1024
@@ -73,6 +76,26 @@ def fit_normalization(
     if sensor is not None:
         sensor = _floored(sensor, **_channels(store, "sensor"))
     return Normalization(fitted["tick"], features, sensor, _fit_state(store, ticks, windows))
+
+
+def resolve_anchor(store: FeatureStore, ticks: Ticks, params: TrainHeadParams) -> TrainHeadParams:
+    """The params with the channels that `train_head.anchor: auto` means on the training `ticks`."""
+    if params.anchor != "auto":
+        return params
+    action, chosen = store.streams["action"], dict[str, int]()
+    enabled = params.features_enabled and params.robot_state_enabled
+    if enabled and store.feature_shape[0] and _readings(store, ticks, "state"):
+        chosen = told_deltas(action, store.streams["state"])
+    groups = action_groups(action["names"], action["units"])
+    one_way = np.zeros(len(groups), bool)
+    if params.sensor_enabled and _readings(store, ticks, "sensor"):
+        _, episode = np.unique(store.episode_of(ticks), return_inverse=True)
+        net = np.zeros((episode.max() + 1, len(groups)))
+        np.add.at(net, episode, store.array("tick/action")[ticks])
+        one_way = np.abs(net.mean(axis=0)) >= ONE_WAY * np.sqrt(np.square(net).mean(axis=0))
+    told = zip(action["names"], groups, one_way, strict=True)
+    anchor = [n for n, group, away in told if n in chosen and group == "translation" and not away]
+    return params.model_copy(update={"anchor": tuple(anchor)})
 
 
 def _fit_state(store: FeatureStore, ticks: Ticks, windows: Windows) -> ChannelStatistics | None:

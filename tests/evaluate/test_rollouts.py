@@ -213,6 +213,19 @@ def test_what_the_policy_sees_is_as_old_as_it_says(monkeypatch: pytest.MonkeyPat
         assert np.ptp(ages) > 0.15
 
 
+def test_several_latencies_are_rolled_out_in_the_same_episodes() -> None:
+    several = rolled(made(), ablations=["state off"], episodes=2, latency_ms=[300, 0, 300])
+    assert several.controllers == ("policy", "0 ms late", "state off", "expert")
+    late, on_time = (rolled(made(), ablations=(), episodes=2, latency_ms=ms) for ms in (300, 0))
+    assert several.table(policy=True).csv() == late.table(policy=True).csv()
+    for one, same in zip(several.of("0 ms late"), on_time.of("policy"), strict=True):
+        np.testing.assert_array_equal(one.trace.offset_mm, same.trace.offset_mm)
+    rates = several.document()["latency_ms"]
+    assert list(rates) == ["0", "300"]
+    assert rates["300"] == several.document()["success"]["policy"]
+    assert not np.array_equal(late.of("policy")[0].trace.offset_mm, one.trace.offset_mm)
+
+
 def test_a_stream_that_is_off_says_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     checkpoint, policy, glance = made()
     normal = checkpoint.normalization

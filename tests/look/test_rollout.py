@@ -15,6 +15,7 @@ from pipeline.look.page.writing import PAGE, write_report
 from pipeline.look.rollout import (
     draw_courses,
     draw_filmstrip,
+    draw_latency,
     draw_paths,
     rollout_report,
     worst_and_median,
@@ -104,6 +105,18 @@ def test_every_section_is_there_and_the_page_is_sound(
     (settings,) = report.blocks(Outline)
     assert settings.content["chunking"] == "none"
     assert_page_is_sound(tmp_path / PAGE)
+
+
+def test_several_latencies_are_drawn() -> None:
+    late = [failed(seed, controller="300 ms late") for seed in range(2)]
+    both = rollouts_of(rollout_episode(0), rollout_episode(1), *late)
+    both = replace(both, settings=both.settings | {"latency_ms": [0, 300]})
+    report = rollout_report(both)
+    assert [section.title for section in report.sections][1] == "A late model"
+    (axis,) = draw_latency(both.by_latency()).axes
+    (line,) = axis.lines[:1]
+    np.testing.assert_array_equal(line.get_xydata(), [[0, 100], [300, 0]])
+    assert "latency" in drawn(report)
 
 
 def test_figures_are_those_of_the_rollouts(rollouts: Rollouts) -> None:

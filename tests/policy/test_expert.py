@@ -317,3 +317,17 @@ def test_default_experts_are_the_seeds(kind: type[ActionExpert], parameters: int
         expert = kind()
     assert (expert.horizon, expert.action_dim) == (8, 7)
     assert sum(p.numel() for p in expert.parameters()) == parameters
+
+
+@pytest.mark.parametrize("kind", [DiffusionActionExpert, FlowMatchingActionExpert])
+def test_several_draws_are_a_batch_that_repeats(kind: type[Any]) -> None:
+    torch.manual_seed(0)
+    expert = kind(horizon=4, action_dim=3, dim=16, layers=1, heads=2, dropout=0.0, draws=3)
+    context, actions = torch.randn(2, 5, 16), torch.randn(2, 4, 3)
+    valid = torch.tensor([[True] * 4, [True, True, False, False]])
+    drawn = [torch.Generator().manual_seed(1) for _ in range(2)]
+    loss, _ = expert.loss(context, actions, valid, drawn[0])
+    expert.draws = 1
+    alike = [x.repeat(3, *[1] * (x.ndim - 1)) for x in (context, actions, valid)]
+    torch.testing.assert_close(expert.loss(*alike, drawn[1])[0], loss)
+    assert not loss.isclose(expert.loss(context, actions, valid, drawn[1])[0])

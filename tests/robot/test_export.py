@@ -17,13 +17,20 @@ import torch
 from torch.export import ExportedProgram
 
 from pipeline.base.config import ExportParams, TrainHeadParams, load_params
-from pipeline.base.errors import ConfigError, NumericsError
+from pipeline.base.errors import CheckpointMismatch, ConfigError, NumericsError
 from pipeline.policy.checkpoint import PolicyCheckpoint
 from pipeline.policy.normalization import ChannelStatistics, Normalization
 from pipeline.policy.observation import PolicyShape
 from pipeline.policy.policy import Policy
 from pipeline.robot import export
-from pipeline.robot.export import Head, export_head, onnx_runner, torch_runner, trace
+from pipeline.robot.export import (
+    ExportedHead,
+    Head,
+    export_head,
+    onnx_runner,
+    torch_runner,
+    trace,
+)
 from pipeline.robot.export_inputs import count_draws, random_inputs
 
 GROUPS = ("translation", "translation", "rotation")
@@ -200,6 +207,30 @@ def test_every_format_is_the_policy(kind: dict[str, Any], export_of: Export) -> 
         pytest.skip("no ONNX: pip install -e '.[export]'")
     assert done.receipt["files"]["head.onnx"]["deviation"]["random"]["std"] < 2e-5
     assert_same(onnx_runner(done.folder / "head.onnx"), done.checkpoint, 2e-5)
+
+
+@pytest.mark.extra
+@needs_onnx
+@pytest.mark.parametrize("kind", [REGRESSION, FLOW], ids=str)
+def test_an_exported_head_answers_for_its_policy_alone(
+    kind: dict[str, Any], export_of: Export
+) -> None:
+    checkpoint, folder, _ = export_of(kind)
+    head, policy = ExportedHead(folder, checkpoint), checkpoint.policy()
+    seen = random_inputs(checkpoint, policy, 3, seed=5)
+    seen.pop("noise", None)
+    observation: Any = SimpleNamespace(**seen)
+
+    def drawn() -> list[torch.Generator]:
+        return [torch.Generator().manual_seed(row) for row in range(3)]
+
+    expected = policy.act(observation, drawn())
+    torch.testing.assert_close(head.act(observation, drawn()), expected, rtol=0, atol=2e-5)
+    other = checkpoint_of(**DIFFUSION)
+    with pytest.raises(CheckpointMismatch, match="It is the head of another checkpoint"):
+        ExportedHead(folder, other)
+    with pytest.raises(CheckpointMismatch, match=r"none/head\.onnx: .* found no such file"):
+        ExportedHead(folder / "none", checkpoint)
 
 
 @pytest.mark.parametrize(

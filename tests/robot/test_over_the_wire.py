@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from pipeline.base.config import RolloutParams, Source
-from pipeline.base.errors import CheckpointMismatch, ConfigError
+from pipeline.base.errors import CheckpointMismatch
 from pipeline.data import open_recordings
 from pipeline.evaluate.rollout_driver import roll_out, roll_out_served
 from pipeline.evaluate.rollouts import Rollouts
@@ -36,6 +36,7 @@ def over_the_wire(served: Any, serving: Served, **changed: Any) -> Rollouts:
     [
         ("regression", {"chunking": "temporal", "level": "moved", "seed": 78}),
         ("flow_matching", {"chunking": "rtc"}),
+        ("regression", {"latency_ms": [400, 100]}),
     ],
 )
 def test_the_same_seed_gives_the_same_episode_bit_for_bit(
@@ -66,11 +67,6 @@ def test_several_steps_of_a_chunk_are_played_between_two_questions(
     steps = wired.of("policy")[0].ticks - 1  # the first tick is over when the episode begins
     # Frames go along with every question then: more than `vlm_reuse_count` ticks lie between.
     assert len(served.glance.passes) == -(-steps // 4)
-
-
-def test_a_latency_is_not_simulated_over_the_wire(served_policy: Served, serving: Served) -> None:
-    with pytest.raises(ConfigError, match=r"without rollout\.server to simulate it"):
-        over_the_wire(served_policy(), serving, latency_ms=300)
 
 
 def test_another_robots_server_is_refused(served_policy: Served, serving: Served) -> None:

@@ -307,6 +307,19 @@ def test_another_robot_is_refused_before_the_model_looks(
     assert served.glance.passes == []
 
 
+def test_features_older_than_in_training_are_warned_of_once(
+    served_policy: Callable[..., Any], observe: Observe
+) -> None:
+    served = served_policy()
+    session = served.session()
+    no_frames: dict[str, Any] = {f"images/{view}": None for view in VIEWS}
+    assert session.infer(observe(0))["trained_age_s"] == pytest.approx(0.3)
+    for tick in range(1, 7):
+        session.infer(observe(tick, **no_frames))
+    (said,) = served.said
+    assert "features are 0.40 s old" in said and "at most 0.30 s" in said
+
+
 def test_metadata_says_all_that_a_robot_needs(served_policy: Callable[..., Any]) -> None:
     served = served_policy("flow_matching")
     metadata = served.metadata

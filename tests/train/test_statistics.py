@@ -9,12 +9,13 @@ import numpy as np
 import pytest
 import zarr
 
+from pipeline.base.config import TrainHeadParams
 from pipeline.base.errors import NumericsError
 from pipeline.policy.attention import right_aligned
 from pipeline.store import FeatureStore
 from pipeline.store.chunks import write_seal
 from pipeline.train.batches import Windows
-from pipeline.train.statistics import fit_normalization
+from pipeline.train.statistics import fit_normalization, resolve_anchor
 
 Patch = pytest.MonkeyPatch
 Make = Callable[..., Any]
@@ -133,6 +134,30 @@ def test_threads_change_no_bit(
     store.array("state/values")[121, 0] = np.inf
     with pytest.raises(NumericsError, match=r"episode_001, state reading 1 \(at 0.025 s\)"):
         fit_normalization(store, ticks, WINDOWS, threads=3)
+
+
+@pytest.mark.parametrize(
+    ("changed", "anchor"),
+    [
+        ({}, ("dx",)),  # all episodes go down dz, whose depth the sensor tells
+        ({"sensor_enabled": False}, ("dx", "dz")),
+        ({"robot_state_enabled": False}, ()),
+        ({"features_enabled": False}, ()),
+        ({"anchor": ["dz"]}, ("dz",)),
+        ({"anchor": "none"}, ()),
+    ],
+)
+def test_anchored_are_translations_that_go_either_way(
+    tiny_store: Make, tmp_path: Path, monkeypatch: Patch, changed: dict[str, Any], anchor: Any
+) -> None:
+    store = FeatureStore.open(tiny_store(tmp_path))
+    state = {"names": ["x", "z", "a", "gripper"], "units": ["mm", "mm", "deg", ""]}
+    streams = store.streams | {"state": store.streams["state"] | state}
+    monkeypatch.setattr(FeatureStore, "streams", streams)
+    action, episode = store.array("tick/action"), store.episode_of(np.arange(store.ticks))
+    action[:, 0], action[:, 2] = np.where(episode % 2, 1.0, -1.0), 1.0
+    params = TrainHeadParams.model_validate(changed)
+    assert resolve_anchor(store, np.arange(store.ticks), params).anchor == anchor
 
 
 def test_what_rested_in_training_is_no_unit_of_what_moves_later(

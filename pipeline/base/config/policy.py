@@ -62,13 +62,16 @@ class RegressionParams(Section):
 class DiffusionParams(Section):
     """What only the diffusion expert has."""
 
+    draws: int = Field(default=4, ge=1, le=1000)
+    """Noises and steps of the schedule that each chunk is trained on at once: the context, which
+    costs most, is computed once for all of them."""
     timesteps: int = Field(default=100, ge=2, le=10_000)
     """Steps of the noise schedule."""
     schedule: Literal["cosine", "linear"] = "cosine"
     """How the noise grows over them."""
-    prediction: Literal["epsilon", "sample", "v"] = "v"
-    """What the network predicts: the noise, the clean chunk, or the velocity between them, which
-    learns fastest on the demo."""
+    prediction: Literal["epsilon", "sample", "v"] = "sample"
+    """What the network predicts: the noise, the clean chunk, which inserts most often on the demo,
+    or the velocity between them."""
     sampler: Literal["ddpm", "ddim"] = "ddim"
     """`ddpm` takes every step of the schedule, `ddim` as many as `sampling_steps`."""
     sampling_steps: int = Field(default=10, ge=1, le=10_000)
@@ -90,11 +93,13 @@ class DiffusionParams(Section):
 class FlowMatchingParams(Section):
     """What only the flow-matching expert has."""
 
+    draws: int = Field(default=4, ge=1, le=1000)
+    """As `diffusion.draws`: noises and times at once."""
     sampling_steps: int = Field(default=10, ge=1, le=10_000)
     """Of the ODE solver."""
     solver: Literal["euler", "midpoint", "rk4"] = "euler"
     """One, two or four evaluations of the network a step."""
-    time: Literal["uniform", "beta"] = "uniform"
+    time: Literal["uniform", "beta"] = "beta"
     """How times are drawn in training."""
     alpha: float = Field(default=1.5, gt=0, le=1e3)
     """Of the beta distribution of the noise's share 1 - t: above `beta`, noisy times are drawn

@@ -2,9 +2,9 @@
 
 import math
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field, field_validator, model_validator
 
 from pipeline.base.config.policy import (
     DiffusionParams,
@@ -26,6 +26,7 @@ RolloutAblation = Literal[
 ExportFormat = Literal["onnx", "torch"]
 LoggerName = Literal["tensorboard", "wandb"]
 Weight = Annotated[float, Field(ge=0, le=1e6)]
+Latency = Annotated[float, Field(ge=0, le=60_000)]
 Share = Annotated[float, Field(ge=0, lt=1)]
 
 
@@ -109,10 +110,11 @@ class TrainHeadParams(Section):
     feature_lag: int = Field(default=0, ge=0, le=1000)
     """Most VL rows that features come late in training, drawn evenly for each sample: so a policy
     learns what a slow model does to it."""
-    anchor: tuple[str, ...] = ()
+    anchor: Literal["auto"] | tuple[str, ...] = "auto"
     """Action channels that count from where the arm was when the newest frame was taken, such as
     `[dx, dy]`: what vision tells stays true when the model is late. They are deltas whose motion
-    the state tells."""
+    the state tells. `auto` takes the translations among them; with a sensor, not those in which all
+    training episodes advance the same way, for the sensor tells their depth. none: no channel."""
     anchor_s: float = Field(default=2.0, gt=0, le=3600)
     """Seconds back that the motion since a frame is known; a frame that is older counts as so old.
     """
@@ -196,14 +198,24 @@ class TrainHeadParams(Section):
     wandb_project: str = "vla-feature-cache"
     """Where Weights & Biases puts the run; its own environment variables decide the rest."""
 
+    @field_validator("anchor", mode="before")
+    @classmethod
+    def _no_anchor(cls, value: Any) -> Any:
+        return () if value == "none" else value
+
     @model_validator(mode="after")
     def _anchor_has_what_it_needs(self) -> "TrainHeadParams":
-        if self.anchor and not (self.features_enabled and self.robot_state_enabled):
+        if self.anchored and not (self.features_enabled and self.robot_state_enabled):
             raise ValueError(
                 "anchor counts from the newest frame by the state's motion: enable features and "
-                "robot state, or set anchor to []"
+                "robot state, or set anchor to none"
             )
         return self
+
+    @property
+    def anchored(self) -> bool:
+        """Whether channels are anchored; `auto` anchors none before training has chosen them."""
+        return self.anchor not in ("auto", ())
 
     @property
     def sensor_reach_s(self) -> float | None:
@@ -213,9 +225,16 @@ class TrainHeadParams(Section):
     @property
     def state_reach_s(self) -> float | None:
         """Seconds before the tick of the oldest state that is looked at."""
-        if self.state_window_s is None or not self.anchor:
+        if self.state_window_s is None or not self.anchored:
             return self.state_window_s
         return max(self.state_window_s, self.anchor_s)
+
+    def trained_age_s(self, reuse_s: float) -> float:
+        """Up to which age training knows features that serve ticks for `reuse_s` each.
+
+        Anchored, a frame stays true for as long as the motion since then is known.
+        """
+        return self.anchor_s if self.anchored else reuse_s * (1 + self.feature_lag)
 
     @property
     def state_readings(self) -> int:
@@ -270,13 +289,16 @@ class RolloutParams(Section):
     """Of the first episode; those that follow have the seeds that follow."""
     execute: int = Field(default=1, ge=1, le=1000)
     """Steps of a chunk that are carried out before the head is asked for the next."""
-    chunking: Chunking = "none"
+    chunking: Chunking = "temporal"
     """none: the newest chunk. temporal: the weighted mean of all chunks that reach the tick
     (temporal ensembling). rtc: each chunk is drawn to continue the last (real-time chunking), for
     experts that sample."""
-    latency_ms: float = Field(default=0.0, ge=0, le=60_000)
+    latency_ms: Latency | Annotated[tuple[Latency, ...], Field(min_length=1)] = 0.0
     """What a pass of the model takes, in simulated time: its features are so much older. The head
-    answers at once."""
+    answers at once. Of several, such as `[0, 300, 600]`, the page draws success against latency;
+    the first is that of all else."""
+    head: Place | None = None
+    """Folder of `stages.export`, whose head.onnx answers in place of the checkpoint's own head."""
     ablations: tuple[RolloutAblation, ...] = ("sensor off", "features off")
     """Also run the policy with a stream spoilt. off: every value at its training mean. frozen: all
     as the stream was first, as if it were new. What a policy does not look at is passed over, and
@@ -289,6 +311,18 @@ class RolloutParams(Section):
     """auto, cpu, cuda or cuda:N."""
     output: Output = Path("reports/rollout")
     """Folder of metrics, table and page."""
+
+    @model_validator(mode="after")
+    def _one_answers(self) -> "RolloutParams":
+        if self.head is not None and self.server is not None:
+            raise ValueError("head and server: either an exported head answers or a server does")
+        return self
+
+    @property
+    def latencies_ms(self) -> tuple[float, ...]:
+        """Each latency once, in the order given."""
+        given = self.latency_ms if isinstance(self.latency_ms, tuple) else (self.latency_ms,)
+        return tuple(dict.fromkeys(given))
 
 
 class ServeParams(Section):
