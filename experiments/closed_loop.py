@@ -56,6 +56,7 @@ _AS_IT_IS = (
     *(f"{key}=null" for key in ("train_head.store", "evaluate.store", "evaluate.checkpoint")),
     *("rollout.checkpoint=null", "rollout.environment=phantom", "rollout.level=full"),
     *("rollout.execute=1", "rollout.chunking=none", "rollout.latency_ms=0"),
+    "train_head.anchor=none",
 )
 """What a recipe or a rollout takes for granted, whatever params.yaml says."""
 _WRITE_PAGE = "pipeline.look.page.writing.write_report"

@@ -123,6 +123,16 @@ _MOTION = {
     "pipeline.train.statistics.expanded_names": _with_motion_names,
 }
 _LATE = ("train_head.feature_lag=2",)
+_ANCHORED = ("train_head.anchor=[dx, dy]",)
+# As the published table has them: one noise a chunk.
+_DIFFUSION = (
+    "train_head.model_type=diffusion",
+    *("train_head.diffusion.draws=1", "train_head.diffusion.prediction=v"),
+)
+_FLOW_MATCHING = (
+    "train_head.model_type=flow_matching",
+    *("train_head.flow_matching.draws=1", "train_head.flow_matching.time=uniform"),
+)
 _LONGER = ("train_head.max_steps=2000", "train_head.eval_every=200")
 
 
@@ -152,8 +162,10 @@ _RESIDUAL = {
 RECIPES = {
     AS_IT_IS: Recipe(),
     # experts and fusions
-    "diffusion": Recipe(("train_head.model_type=diffusion",)),
-    "flow matching": Recipe(("train_head.model_type=flow_matching",)),
+    "diffusion": Recipe(_DIFFUSION),
+    "flow matching": Recipe(_FLOW_MATCHING),
+    "diffusion by default": Recipe((*_ANCHORED, "train_head.model_type=diffusion")),
+    "flow matching by default": Recipe((*_ANCHORED, "train_head.model_type=flow_matching")),
     "cross attention": Recipe(("train_head.fusion_strategy=cross_attention",)),
     "gated": Recipe(("train_head.fusion_strategy=gated",)),
     "no fusion": Recipe(("train_head.fusion_strategy=none",)),
@@ -182,12 +194,12 @@ RECIPES = {
     "own motion seen, dropped": Recipe(("train_head.drop_state=0.5",), _MOTION),
     # how it learns
     "four times as long": Recipe(_LONGER),
-    "flow matching, four times as long": Recipe((*_LONGER, "train_head.model_type=flow_matching")),
+    "flow matching, four times as long": Recipe((*_LONGER, *_FLOW_MATCHING)),
     "late in training": Recipe(_LATE),
     "somewhat late in training": Recipe(
         ("train_head.feature_lag=1", "train_head.sensor_lag_s=0.05")
     ),
-    "anchored": Recipe(("train_head.anchor=[dx, dy]",)),
+    "anchored": Recipe(_ANCHORED),
     "not averaged": Recipe(("train_head.ema_decay=0.0",)),
     "horizon 16": Recipe(("train_head.horizon=16",)),
     "residual over own motion": Recipe(patches=_RESIDUAL),
@@ -206,6 +218,10 @@ _AVERAGED = ("temporal", *(f"temporal, {ticks} ticks late" for ticks in (3, 6, 1
 TABLES = {
     "experts": Table(
         (AS_IT_IS, "diffusion", "flow matching", "cross attention", "gated", "no fusion")
+    ),
+    "drawn": Table(
+        ("diffusion by default", "flow matching by default"),
+        (ON_TIME, "temporal", "temporal, 6 ticks late"),
     ),
     "inputs": Table(
         (AS_IT_IS, "own motion seen", "own motion seen, dropped", "residual over own motion")

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from pipeline.base.errors import RecordingError
@@ -24,6 +24,7 @@ def cut(values: np.ndarray, time: np.ndarray, width: int, stride: int):
     held=st.integers(1, 3),
     seed=st.integers(0, 999),
 )
+@example(width=3, overlap=0.0, windows=2, jitter=0.0, hz_error=1.0, held=2, seed=0)
 def test_any_cut_is_undone(width, overlap, windows, jitter, hz_error, held, seed):
     stride = max(1, round(width * (1 - overlap)))
     rng = np.random.default_rng(seed)
