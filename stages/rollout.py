@@ -65,7 +65,6 @@ def _here(params: "Params", say: Callable[[str], None]) -> "Rollouts":
     from pipeline.base.device import resolve_device
     from pipeline.evaluate.rollout_driver import roll_out
     from pipeline.policy.checkpoint import find_policy, load_policy
-    from pipeline.robot.export import ExportedHead
     from pipeline.robot.live_features import LiveFeatures
 
     wanted = params.rollout
@@ -73,11 +72,13 @@ def _here(params: "Params", say: Callable[[str], None]) -> "Rollouts":
     checkpoint = load_policy(find_policy(folder))
     device = resolve_device(wanted.device)
     load = partial(LiveFeatures, params.vlm, checkpoint.source["feature_spec"], str(device))
-    head = wanted.head and ExportedHead(wanted.head, checkpoint)
-    answers = f", {wanted.head} answers" if head else ""
+    act, answers = None, ""
+    if wanted.head is not None:
+        from pipeline.robot.export import ExportedHead
+
+        act, answers = ExportedHead(wanted.head, checkpoint).act, f", {wanted.head} answers"
     say(f"{folder} (step {checkpoint.step}), level {wanted.level}, device {device}{answers}")
-    policy, act = checkpoint.policy(device), head and head.act
-    return roll_out(checkpoint, str(folder), policy, load, wanted, say, act)
+    return roll_out(checkpoint, str(folder), checkpoint.policy(device), load, wanted, say, act)
 
 
 def _served(wanted: "RolloutParams", say: Callable[[str], None]) -> "Rollouts":

@@ -16,7 +16,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from pipeline.base.commands import command
-from pipeline.base.config import Level, RolloutAblation, RolloutParams
+from pipeline.base.config import Level, RolloutAblation, RolloutParams, latencies_ms
 from pipeline.base.errors import CheckpointMismatch, ConfigError
 from pipeline.base.observation import Observation
 from pipeline.evaluate.rollouts import (
@@ -167,7 +167,7 @@ def _run_episodes(
     side_by_side = driver.side_by_side
     groups = [seeds[at : at + side_by_side] for at in range(0, len(seeds), side_by_side)]
     episodes: list[RolloutEpisode] = []
-    first_ms, *others_ms = wanted.latencies_ms
+    first_ms, *others_ms = latencies_ms(wanted.latency_ms)
     ways: list[tuple[str, float, RolloutAblation | None]] = [
         (POLICY, first_ms, None),
         *((late_name(latency_ms), latency_ms, None) for latency_ms in others_ms),

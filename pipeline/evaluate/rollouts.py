@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import binomtest
 
+from pipeline.base.config import latencies_ms
 from pipeline.base.table import Table
 from pipeline.simulation.insertion import InsertionTrace
 
@@ -107,8 +108,7 @@ class Rollouts:
 
     def by_latency(self) -> dict[float, SuccessRate]:
         """The policy's success by what a pass of the model takes, ms, in rising order."""
-        rates, given = self.rates(), self.settings["latency_ms"]
-        first, *others = dict.fromkeys(given if isinstance(given, Sequence) else (given,))
+        rates, (first, *others) = self.rates(), latencies_ms(self.settings["latency_ms"])
         names = {first: POLICY} | {latency_ms: late_name(latency_ms) for latency_ms in others}
         return {latency_ms: rates[names[latency_ms]] for latency_ms in sorted(names)}
 

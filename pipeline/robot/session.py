@@ -56,6 +56,7 @@ class ServedPolicy:
         self._passes = ThreadPoolExecutor(1, "vlm")
         self._head = threading.Lock()
         self._told: set[str] = set()
+        self._age_told = False
         self.metadata = self._metadata()
 
     @classmethod
@@ -134,8 +135,8 @@ class ServedPolicy:
 
     def warn_of_age(self, age_s: float) -> None:
         """Warn once of features that are older than training knows them, beyond clocks' noise."""
-        if age_s > 1.1 * self.metadata["trained_age_s"] and "" not in self._told:
-            self._told.add("")
+        if age_s > 1.1 * self.metadata["trained_age_s"] and not self._age_told:
+            self._age_told = True
             self._say(
                 f"warning: features are {age_s:.2f} s old, and the policy was trained on at most "
                 f"{self.metadata['trained_age_s']:.2f} s: expect worse actions. Train with "

@@ -43,6 +43,8 @@ def test_it_writes_metrics_table_and_page_the_same_every_time(
         ({"execute": 99}, "rollout.execute"),
         ({"chunking": "rtc"}, "rollout.chunking"),
         ({"level": "hard"}, "rollout.level"),
+        ({"head": "nowhere"}, "nowhere/head.onnx: expected the head of this checkpoint"),
+        ({"head": "nowhere", "server": "ws://127.0.0.1:1"}, "either an exported head answers or"),
     ],
 )
 def test_what_cannot_be_run_is_refused_by_name(

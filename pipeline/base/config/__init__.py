@@ -37,5 +37,6 @@ from pipeline.base.config.stage_two import (
     SplitParams,
     TrainHeadParams,
     TuningParams,
+    latencies_ms,
 )
 from pipeline.base.config.stores import ProbeParams, StoresParams

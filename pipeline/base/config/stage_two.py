@@ -1,6 +1,7 @@
 """Sections of training, of tuning the vision-language model itself, and of evaluation."""
 
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -272,6 +273,11 @@ class EvaluateParams(Section):
     checksum; false where that takes too long."""
 
 
+def latencies_ms(given: float | Sequence[float]) -> tuple[float, ...]:
+    """Each latency of `rollout.latency_ms` once, in the order given."""
+    return tuple(dict.fromkeys(given if isinstance(given, Sequence) else (given,)))
+
+
 class RolloutParams(Section):
     """How a policy runs closed loop in the simulation, and where the report goes."""
 
@@ -317,12 +323,6 @@ class RolloutParams(Section):
         if self.head is not None and self.server is not None:
             raise ValueError("head and server: either an exported head answers or a server does")
         return self
-
-    @property
-    def latencies_ms(self) -> tuple[float, ...]:
-        """Each latency once, in the order given."""
-        given = self.latency_ms if isinstance(self.latency_ms, tuple) else (self.latency_ms,)
-        return tuple(dict.fromkeys(given))
 
 
 class ServeParams(Section):
