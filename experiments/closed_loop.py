@@ -10,10 +10,11 @@ already in FOLDER is not done again, so a command that was stopped goes on, and 
 policies; rollouts of another number of episodes are done again.
 
 `worth` and `staleness` run nothing. They draw what is in FOLDER: success against errors on
-recordings, a point a policy; and success against what a pass of the model takes (table `latency`).
+recordings, a point a policy; and success against what a pass of the model takes (tables `latency`,
+`before` and `many`).
 
 The last line is JSON: of each row success with Wilson's interval over the rollouts of all seeds,
-and the errors in training std over all seeds and their differences from the policy as it is
+and the errors in training std over all seeds and their differences from the table's first row
 (intervals: paired bootstrap over groups of recordings).
 """
 
@@ -39,7 +40,10 @@ from tqdm import tqdm
 from experiments.recipes import (
     AS_IT_IS,
     LATE,
+    NEWEST,
+    NOT_ANCHORED,
     ON_TIME,
+    PATCHES,
     RECIPES,
     ROLLOUTS,
     STORES,
@@ -55,8 +59,8 @@ FIGURES = ("executed", "overall")
 _AS_IT_IS = (
     *(f"{key}=null" for key in ("train_head.store", "evaluate.store", "evaluate.checkpoint")),
     *("rollout.checkpoint=null", "rollout.environment=phantom", "rollout.level=full"),
-    *("rollout.execute=1", "rollout.chunking=none", "rollout.latency_ms=0"),
-    "train_head.anchor=none",
+    *("rollout.execute=1", "rollout.chunking=temporal", "rollout.latency_ms=0"),
+    "train_head.anchor=auto",
 )
 """What a recipe or a rollout takes for granted, whatever params.yaml says."""
 _WRITE_PAGE = "pipeline.look.page.writing.write_report"
@@ -192,14 +196,17 @@ def _work(wanted: Namespace, name: str, seed: int, rollouts: tuple[str, ...]) ->
                 said = [text.format(folder=folder) for text in ROLLOUTS[way]]
                 told = [*common, *said, f"rollout.output={folder / way}"]
                 # Their pages take a tenth of the time; a row that surprises can be run again.
-                with patch(_WRITE_PAGE, lambda *_: []):
+                replaced = {_WRITE_PAGE: lambda *_: [], **PATCHES.get(way, {})}
+                with ExitStack() as patched:
+                    for place, value in replaced.items():
+                        patched.enter_context(patch(place, value))
                     rollout.main(load_params(Path("params.yaml"), told))
 
 
 def _rows(
     wanted: Namespace, name: str, rollout: str
 ) -> Iterator[tuple[str, dict[str, list[float]]]]:
-    """A row for each controller of a rollout: success, median miss and, on time, errors."""
+    """A row for each controller of a rollout: success, median miss and, in the first, errors."""
     folders = [_folder(wanted.out, name, seed) for seed in range(wanted.seeds)]
     episodes = _episodes([folder / rollout for folder in folders])
     if wanted.table != "levels":
@@ -207,7 +214,7 @@ def _rows(
     for controller, ended in episodes.items():
         miss = float(np.median([float(row["lateral_mm"]) for row in ended]))
         figures = {"success": _success(ended), "lateral_mm": [round(miss, 3)]}
-        if controller == POLICY and rollout == ON_TIME:
+        if controller == POLICY and rollout == TABLES[wanted.table].rollouts[0]:
             figures |= _errors_beside(wanted, folders)
         others = [] if controller == POLICY else [controller]
         yield " | ".join([name, rollout, *others]), figures
@@ -223,9 +230,10 @@ def _episodes(rollouts: list[Path]) -> dict[str, list[dict[str, str]]]:
 
 
 def _errors_beside(wanted: Namespace, folders: list[Path]) -> dict[str, list[float]]:
-    """Both errors, and where the test ticks are the same, less those of the policy as it is."""
+    """Both errors, and where the test ticks are the same, less those of the table's first row."""
     own, counts = _errors(folders)
-    base = [_folder(wanted.out, AS_IT_IS, seed) for seed in range(wanted.seeds)]
+    first = TABLES[wanted.table].recipes[0]
+    base = [_folder(wanted.out, first, seed) for seed in range(wanted.seeds)]
     known = all((folder / "report" / "groups.csv").exists() for folder in base)
     before, same = _errors(base) if known else (own, np.zeros(0))
     figures: dict[str, list[float]] = {}
@@ -312,12 +320,20 @@ def _draw_staleness(wanted: Namespace) -> None:
     """Success with its interval against the latency of the model, a curve a recipe."""
     from pipeline.look.page import style
 
+    ways = {ON_TIME: 0, **LATE}
+    before = {NEWEST: 0} | {f"{NEWEST}, {late}": ms for late, ms in LATE.items()}
+    drawn = [
+        ("anchored, 300 demonstrations", "300 demonstrations", ways),
+        ("anchored (default)", AS_IT_IS, ways),
+        ("anchored, late in training too", "late in training", ways),
+        ("as it was: not anchored, newest chunk", NOT_ANCHORED, before),
+    ]
     curves: dict[str, dict[int, list[float]]] = {}
-    for name in TABLES["latency"].recipes:
+    for label, name, played in drawn:
         folders = [_folder(wanted.out, name, seed) for seed in range(wanted.seeds)]
-        for way, ticks in {ON_TIME: 0, **LATE}.items():
+        for way, ms in played.items():
             if episodes := _episodes([folder / way for folder in folders]).get(POLICY):
-                curves.setdefault(name, {})[100 * ticks] = _success(episodes)
+                curves.setdefault(label, {})[ms] = _success(episodes)
     if not curves:
         raise SystemExit(f"{wanted.out}: nothing to draw. Make the table `latency` there first.")
 

@@ -13,8 +13,11 @@ from pipeline.base.config import RolloutAblation
 from pipeline.base.observation import Observation
 from pipeline.policy import shape, state_channels
 from pipeline.policy.policy import Policy
+from pipeline.robot.robot_memory import RobotMemory
 
 AS_IT_IS, ON_TIME = "as it is", "on time"
+NOT_ANCHORED, NEWEST = "not anchored", "newest chunk"
+"""How policies were trained and played before anchoring; tables of that time keep to it."""
 
 
 @dataclass(frozen=True)
@@ -70,27 +73,53 @@ STORES = {
     "large": Store((("extract", _LARGE),), _LARGE),
 }
 
-LATE = {f"{ticks} tick{'s' * (ticks > 1)} late": ticks for ticks in (1, 2, 3, 4, 6, 8, 10)}
-"""Ways to roll out with a late model, and how many ticks of 0.1 s a pass takes."""
+LATE = {f"{ms} ms": ms for ms in (100, 300, 600, 1000)}
+"""Ways to roll out with a late model, and what a pass takes."""
+_NEWEST = "rollout.chunking=none"
 
 # {folder} stands for that of the policy.
 ROLLOUTS: dict[str, tuple[str, ...]] = {
     ON_TIME: (),
     "depth": ("rollout.level=depth",),
     "moved": ("rollout.level=moved",),
-    "temporal": ("rollout.chunking=temporal",),
+    NEWEST: (_NEWEST,),
     "rtc": ("rollout.chunking=rtc", "rollout.execute=3"),
-    **{late: (f"rollout.latency_ms={ticks * 100}",) for late, ticks in LATE.items()},
+    **{late: (f"rollout.latency_ms={ms}",) for late, ms in LATE.items()},
     **{
-        f"temporal, {late}": ("rollout.chunking=temporal", f"rollout.latency_ms={ticks * 100}")
-        for late, ticks in LATE.items()
+        f"moved, {late}": ("rollout.level=moved", f"rollout.latency_ms={LATE[late]}")
+        for late in LATE
     },
-    "3 ticks late, 3 steps": ("rollout.latency_ms=300", "rollout.execute=3"),
-    "6 ticks late, 6 steps": ("rollout.latency_ms=600", "rollout.execute=6"),
-    **{f"{steps} steps": (f"rollout.execute={steps}",) for steps in (2, 3, 4, 6, 8)},
+    **{f"{NEWEST}, {late}": (_NEWEST, f"rollout.latency_ms={ms}") for late, ms in LATE.items()},
+    **{f"{late}, state too": (f"rollout.latency_ms={ms}",) for late, ms in LATE.items()},
+    **{f"{n} steps": (_NEWEST, f"rollout.execute={n}") for n in (2, 3, 4, 6, 8)},
+    **{f"state {late}": () for late in LATE},
     "last weights": ("rollout.checkpoint={folder}/model/last",),
     "spoilt": (f"rollout.ablations={json.dumps(get_args(RolloutAblation))}",),
 }
+
+
+def _late_state(latency_s: float) -> Any:
+    """`RobotMemory.sense` of states that come `latency_s` late; the sensor stays on time."""
+
+    def sense(memory: RobotMemory, readings: Mapping[str, Any]) -> None:
+        waiting = memory.__dict__.setdefault("waiting", [])
+        waiting.append((float(readings["time"][0]), readings))
+        due = waiting[0][0] <= waiting[-1][0] - latency_s + 1e-9
+        state = waiting.pop(0)[1] if due else {}
+        now = {name: value for name, value in readings.items() if not name.startswith("state")}
+        _sense(memory, now | {name: state[name] for name in ("state", "state_time") if due})
+
+    return sense
+
+
+_sense = RobotMemory.sense
+_SENSE = "pipeline.robot.robot_memory.RobotMemory.sense"
+PATCHES: dict[str, dict[str, Any]] = {
+    text.format(late): {_SENSE: _late_state(ms / 1000)}
+    for late, ms in LATE.items()
+    for text in ("{}, state too", "state {}")
+}
+"""What stands in the code in place of a name, for one way to roll out."""
 
 
 def _plain(names: Any, units: Any) -> tuple[str, ...]:
@@ -123,17 +152,12 @@ _MOTION = {
     "pipeline.train.statistics.expanded_names": _with_motion_names,
 }
 _LATE = ("train_head.feature_lag=2",)
-_ANCHORED = ("train_head.anchor=[dx, dy]",)
-# As the published table has them: one noise a chunk.
-_DIFFUSION = (
-    "train_head.model_type=diffusion",
-    *("train_head.diffusion.draws=1", "train_head.diffusion.prediction=v"),
-)
-_FLOW_MATCHING = (
-    "train_head.model_type=flow_matching",
-    *("train_head.flow_matching.draws=1", "train_head.flow_matching.time=uniform"),
-)
+_TICK = ("train_head.anchor=none",)
+_DIFFUSION = ("train_head.model_type=diffusion",)
+_FLOW_MATCHING = ("train_head.model_type=flow_matching",)
+_ONE_NOISE = ("train_head.diffusion.draws=1", "train_head.flow_matching.draws=1")
 _LONGER = ("train_head.max_steps=2000", "train_head.eval_every=200")
+_300 = ("train_head.split.train=300",)
 
 
 def _motion(observation: Observation) -> torch.Tensor:
@@ -161,11 +185,12 @@ _RESIDUAL = {
 
 RECIPES = {
     AS_IT_IS: Recipe(),
+    NOT_ANCHORED: Recipe(_TICK),
     # experts and fusions
     "diffusion": Recipe(_DIFFUSION),
     "flow matching": Recipe(_FLOW_MATCHING),
-    "diffusion by default": Recipe((*_ANCHORED, "train_head.model_type=diffusion")),
-    "flow matching by default": Recipe((*_ANCHORED, "train_head.model_type=flow_matching")),
+    "diffusion, one noise": Recipe((*_DIFFUSION, *_ONE_NOISE)),
+    "flow matching, one noise": Recipe((*_FLOW_MATCHING, *_ONE_NOISE)),
     "cross attention": Recipe(("train_head.fusion_strategy=cross_attention",)),
     "gated": Recipe(("train_head.fusion_strategy=gated",)),
     "no fusion": Recipe(("train_head.fusion_strategy=none",)),
@@ -190,8 +215,8 @@ RECIPES = {
             "pipeline.policy.normalization._LEAST_SPREAD": 0.0,
         }
     ),
-    "own motion seen": Recipe(patches=_MOTION),
-    "own motion seen, dropped": Recipe(("train_head.drop_state=0.5",), _MOTION),
+    "own motion seen": Recipe(_TICK, _MOTION),
+    "own motion seen, dropped": Recipe((*_TICK, "train_head.drop_state=0.5"), _MOTION),
     # how it learns
     "four times as long": Recipe(_LONGER),
     "flow matching, four times as long": Recipe((*_LONGER, *_FLOW_MATCHING)),
@@ -199,32 +224,31 @@ RECIPES = {
     "somewhat late in training": Recipe(
         ("train_head.feature_lag=1", "train_head.sensor_lag_s=0.05")
     ),
-    "anchored": Recipe(_ANCHORED),
     "not averaged": Recipe(("train_head.ema_decay=0.0",)),
     "horizon 16": Recipe(("train_head.horizon=16",)),
-    "residual over own motion": Recipe(patches=_RESIDUAL),
+    "residual over own motion": Recipe(_TICK, _RESIDUAL),
     # how much it has seen
     **{
         f"{count} demonstrations": Recipe((f"train_head.split.train={count}",), store="many")
         for count in (10, 30, 100, 300)
     },
+    "diffusion, 300 demonstrations": Recipe((*_300, *_DIFFUSION), store="many"),
+    "flow matching, 300 demonstrations": Recipe((*_300, *_FLOW_MATCHING), store="many"),
     # what sees
     "tuned model": Recipe(store="tuned"),
     "larger images": Recipe(store="large"),
 }
 
-_LATER = (ON_TIME, *(way for way in ROLLOUTS if "late" in way and "temporal" not in way))
-_AVERAGED = ("temporal", *(f"temporal, {ticks} ticks late" for ticks in (3, 6, 10)))
+_LATER = (ON_TIME, *LATE)
+_AS_BEFORE = tuple(way for way in ROLLOUTS if way.startswith(NEWEST))
+_DRAWN = ("diffusion", "flow matching")
 TABLES = {
-    "experts": Table(
-        (AS_IT_IS, "diffusion", "flow matching", "cross attention", "gated", "no fusion")
-    ),
-    "drawn": Table(
-        ("diffusion by default", "flow matching by default"),
-        (ON_TIME, "temporal", "temporal, 6 ticks late"),
-    ),
+    "experts": Table((AS_IT_IS, *_DRAWN, "cross attention", "gated", "no fusion")),
+    "drawn": Table(_DRAWN, (ON_TIME, NEWEST, "600 ms")),
+    "noises": Table(("diffusion, one noise", "flow matching, one noise")),
     "inputs": Table(
-        (AS_IT_IS, "own motion seen", "own motion seen, dropped", "residual over own motion")
+        (NOT_ANCHORED, "own motion seen", "own motion seen, dropped", "residual over own motion"),
+        (NEWEST,),
     ),
     "streams": Table((AS_IT_IS, "no state", "no sensor", "no features")),
     "rules": Table(
@@ -240,11 +264,18 @@ TABLES = {
     "spoilt": Table((AS_IT_IS,), ("spoilt",)),
     "checkpoint": Table((AS_IT_IS,), (ON_TIME, "last weights")),
     "levels": Table((AS_IT_IS, "300 demonstrations"), (ON_TIME, "depth", "moved")),
-    "latency": Table((AS_IT_IS, "late in training"), _LATER),
-    "anchored": Table((AS_IT_IS, "anchored"), _AVERAGED),
-    "chunking": Table((AS_IT_IS,), (ON_TIME, *(f"{n} steps" for n in (2, 3, 4, 6, 8)), "temporal")),
-    "guided": Table(("flow matching",), (ON_TIME, "3 steps", "temporal", "rtc")),
+    "latency": Table((AS_IT_IS, "late in training", NOT_ANCHORED), _LATER),
+    "before": Table((NOT_ANCHORED,), _AS_BEFORE),
+    "moved": Table((AS_IT_IS,), ("moved", *(f"moved, {late}" for late in LATE))),
+    "oracle": Table(
+        (AS_IT_IS, NOT_ANCHORED),
+        tuple(way for way in PATCHES if "100 ms" not in way),
+    ),
+    "chunking": Table((AS_IT_IS,), (ON_TIME, NEWEST, *(f"{n} steps" for n in (2, 3, 4, 6, 8)))),
+    "guided": Table(("flow matching",), (ON_TIME, NEWEST, "3 steps", "rtc")),
     "demonstrations": Table(tuple(f"{count} demonstrations" for count in (10, 30, 100, 300))),
+    "many": Table(("300 demonstrations",), _LATER),
+    "many, drawn": Table(tuple(f"{name}, 300 demonstrations" for name in _DRAWN)),
     "model": Table((AS_IT_IS, "tuned model")),
     "images": Table((AS_IT_IS, "larger images")),
     "learning": Table((AS_IT_IS, "horizon 16", "not averaged")),

@@ -124,13 +124,13 @@ def test_worth_of_too_few_policies_says_what_to_do(
 def test_staleness_draws_success_against_latency(
     done: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any
 ) -> None:
-    late = done / "as-it-is-0" / "4 ticks late"
+    late = done / "as-it-is-0" / "300 ms"
     late.mkdir()
     (late / "episodes.csv").write_text("success,lateral_mm\nTrue,0.1\nFalse,3")
     told = run(monkeypatch, capsys, "staleness", "--out", str(done))["by_latency_ms"]
     assert (done / "staleness.png").read_bytes().startswith(b"\x89PNG")
-    assert list(told["as it is"]) == ["0", "400"]
-    assert told["as it is"]["400"][0] == 0.5
+    assert list(told["anchored (default)"]) == ["0", "300"]
+    assert told["anchored (default)"]["300"][0] == 0.5
 
 
 def test_staleness_of_nothing_says_what_to_do(

@@ -18,8 +18,9 @@ if TYPE_CHECKING:
 
 Steps = NDArray[np.float32]
 
-ENSEMBLE_DECAY = 0.01
-"""m of temporal ensembling, as in Zhao et al. 2023: the smaller, the more a new chunk counts."""
+ENSEMBLE_GROWTH = 0.2
+"""Of temporal ensembling: the larger, the more a new chunk counts. It is -0.01 in Zhao et al. 2023:
+with that, policies that draw their chunks insert less often."""
 
 DELAYS = 10
 """Newest delays, the largest of which the next one is expected not to exceed."""
@@ -176,10 +177,10 @@ class Executor:
 def ensemble(predicted: NDArray[np.float64]) -> NDArray[np.float64]:
     """The weighted mean (action,) of predictions (prediction, action) for a tick, oldest first.
 
-    Weights exp(-m i), i = 0 the oldest (Zhao et al. 2023, "Learning Fine-Grained Bimanual
-    Manipulation with Low-Cost Hardware", Algorithm 2).
+    Weights exp(-m i), i = 0 the oldest, with m = -`ENSEMBLE_GROWTH` (Zhao et al. 2023, "Learning
+    Fine-Grained Bimanual Manipulation with Low-Cost Hardware", Algorithm 2).
     """
-    weights = np.exp(-ENSEMBLE_DECAY * np.arange(len(predicted)))
+    weights = np.exp(ENSEMBLE_GROWTH * np.arange(len(predicted)))
     return np.average(predicted, axis=0, weights=weights)
 
 

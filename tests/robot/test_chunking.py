@@ -175,14 +175,14 @@ class TestSteps:
 
 class TestTemporal:
     def test_all_chunks_that_reach_a_tick_are_averaged_the_oldest_first(self) -> None:
-        """In closed form, with the weights of ACT's Algorithm 2."""
+        """In closed form."""
         executor, horizon = Executor("temporal", 1, 3), 3
         names = [5.0, -1.0, 2.0, 8.0]
         for tick, name in enumerate(names):
             executor.begin()
             executor.plan(chunk_of(tick, name, horizon))
             reach = names[max(0, tick - horizon + 1) : tick + 1]
-            weights = [np.exp(-0.01 * i) for i in range(len(reach))]
+            weights = [np.exp(0.2 * i) for i in range(len(reach))]
             mean = sum(w * n for w, n in zip(weights, reach, strict=True)) / sum(weights)
             assert executor.next_action().tolist() == pytest.approx([tick, mean])
 
@@ -194,8 +194,8 @@ class TestTemporal:
                 executor.plan(chunk_of(tick, float(tick)))
                 assert executor.next_action().tolist() == [tick, tick]
 
-    def test_the_oldest_weighs_most(self) -> None:
-        mean = ensemble(np.array([[1.0], [0.0], [0.0]]))
+    def test_the_newest_weighs_most(self) -> None:
+        mean = ensemble(np.array([[0.0], [0.0], [1.0]]))
         assert mean[0] > 1 / 3
         assert ensemble(np.array([[7.0]])) == [7.0]
 
@@ -258,7 +258,7 @@ class TestMoving:
             executor.plan(self.deltas(step))
             plans.append(sent + step * np.arange(1, HORIZON + 1))
             now = [plan[len(plans) - 1 - begun] for begun, plan in enumerate(plans)]
-            place = np.average(now, weights=np.exp(-0.01 * np.arange(len(now))))
+            place = np.average(now, weights=np.exp(0.2 * np.arange(len(now))))
             action = executor.next_action()
             assert action.tolist() == pytest.approx([place - sent, 7.0])
             sent = place

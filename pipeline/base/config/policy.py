@@ -62,7 +62,7 @@ class RegressionParams(Section):
 class DiffusionParams(Section):
     """What only the diffusion expert has."""
 
-    draws: int = Field(default=4, ge=1, le=1000)
+    draws: int = Field(default=3, ge=1, le=1000)
     """Noises and steps of the schedule that each chunk is trained on at once: the context, which
     costs most, is computed once for all of them."""
     timesteps: int = Field(default=100, ge=2, le=10_000)
@@ -74,7 +74,7 @@ class DiffusionParams(Section):
     or the velocity between them."""
     sampler: Literal["ddpm", "ddim"] = "ddim"
     """`ddpm` takes every step of the schedule, `ddim` as many as `sampling_steps`."""
-    sampling_steps: int = Field(default=10, ge=1, le=10_000)
+    sampling_steps: int = Field(default=4, ge=1, le=10_000)
     """Of `ddim`; at most `timesteps`."""
     eta: float = Field(default=0.0, ge=0, le=1)
     """Of `ddim`: 0 is deterministic after the first noise, 1 as random as `ddpm`."""
@@ -93,9 +93,9 @@ class DiffusionParams(Section):
 class FlowMatchingParams(Section):
     """What only the flow-matching expert has."""
 
-    draws: int = Field(default=4, ge=1, le=1000)
+    draws: int = Field(default=3, ge=1, le=1000)
     """As `diffusion.draws`: noises and times at once."""
-    sampling_steps: int = Field(default=10, ge=1, le=10_000)
+    sampling_steps: int = Field(default=4, ge=1, le=10_000)
     """Of the ODE solver."""
     solver: Literal["euler", "midpoint", "rk4"] = "euler"
     """One, two or four evaluations of the network a step."""
