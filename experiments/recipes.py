@@ -224,6 +224,9 @@ RECIPES = {
     "somewhat late in training": Recipe(
         ("train_head.feature_lag=1", "train_head.sensor_lag_s=0.05")
     ),
+    "rotations anchored": Recipe(("train_head.anchor=[dx, dy, rx, ry, rz]",)),
+    "depth anchored": Recipe(("train_head.anchor=[dx, dy, dz]",)),
+    "state dropped": Recipe(("train_head.drop_state=0.8",)),
     "not averaged": Recipe(("train_head.ema_decay=0.0",)),
     "horizon 16": Recipe(("train_head.horizon=16",)),
     "residual over own motion": Recipe(_TICK, _RESIDUAL),
@@ -267,6 +270,8 @@ TABLES = {
     "latency": Table((AS_IT_IS, "late in training", NOT_ANCHORED), _LATER),
     "before": Table((NOT_ANCHORED,), _AS_BEFORE),
     "moved": Table((AS_IT_IS,), ("moved", *(f"moved, {late}" for late in LATE))),
+    "anchors": Table((AS_IT_IS, "rotations anchored", "depth anchored"), (ON_TIME, "600 ms")),
+    "leaning": Table((AS_IT_IS, "state dropped"), (ON_TIME, "600 ms", "spoilt")),
     "oracle": Table(
         (AS_IT_IS, NOT_ANCHORED),
         tuple(way for way in PATCHES if "100 ms" not in way),

@@ -61,6 +61,12 @@ REGRESSION, DIFFUSION, FLOW = (
         ("flow_matching", "gated"),
     )
 )
+FEATURES_ALONE: dict[str, Any] = {
+    "sensor_enabled": False,
+    "robot_state_enabled": False,
+    "model_type": "diffusion",
+    "diffusion": {"timesteps": 6, "sampling_steps": 3, "eta": 1.0},
+}
 UNUSUAL: list[dict[str, Any]] = [
     {
         "fusion_strategy": "none",
@@ -70,18 +76,13 @@ UNUSUAL: list[dict[str, Any]] = [
         "state_window_s": None,
     },
     {
-        "sensor_enabled": False,
-        "robot_state_enabled": False,
-        "model_type": "diffusion",
-        "diffusion": {"timesteps": 6, "sampling_steps": 3, "eta": 1.0},
-    },
-    {
         "features_enabled": False,
         "model_type": "flow_matching",
         "flow_matching": {"sampling_steps": 2, "solver": "rk4"},
     },
 ]
 RARE = [
+    FEATURES_ALONE,
     *UNUSUAL,
     {"sensor_enabled": False, "fusion_strategy": "cross_attention"},
     {"robot_state_enabled": False, "fusion_strategy": "gated"},
@@ -187,7 +188,11 @@ def assert_torch_is_the_policy(done: Exported) -> None:
     assert_same(torch_runner(done.folder / "head.pt2"), done.checkpoint, 1e-5)
 
 
-@pytest.mark.parametrize("kind", UNUSUAL, ids=str)
+@pytest.mark.parametrize(
+    "kind",
+    [FEATURES_ALONE, *(pytest.param(kind, marks=pytest.mark.slow) for kind in UNUSUAL)],
+    ids=str,
+)
 def test_torch_export_is_the_policy(kind: dict[str, Any], tmp_path: Path) -> None:
     checkpoint = checkpoint_of(**kind)
     receipt = exported(tmp_path / "head", checkpoint, "torch")
@@ -197,7 +202,7 @@ def test_torch_export_is_the_policy(kind: dict[str, Any], tmp_path: Path) -> Non
 @pytest.mark.extra
 @pytest.mark.parametrize(
     "kind",
-    [REGRESSION, DIFFUSION, FLOW, *(pytest.param(kind, marks=pytest.mark.slow) for kind in RARE)],
+    [REGRESSION, FLOW, *(pytest.param(kind, marks=pytest.mark.slow) for kind in RARE)],
     ids=str,
 )
 def test_every_format_is_the_policy(kind: dict[str, Any], export_of: Export) -> None:
