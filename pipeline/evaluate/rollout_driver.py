@@ -470,7 +470,8 @@ class _ServedDriver(_Driver[_ServedRobot]):
         """The server's answers, each waited for."""
         assert ablation is None, "a served policy sees what there is"
         for robot in active:
-            if robot.loop.frames_due:
+            # Only where a question follows: the server counts ticks between questions with frames.
+            if robot.loop.frames_due and robot.loop.chunk_due:
                 self._photograph(robot)
         asking = [robot for robot in active if robot.sees and robot.loop.chunk_due]
         return [(robot, self._ask(robot)) for robot in asking]

@@ -11,6 +11,7 @@ from torch import Generator, Tensor, nn
 from pipeline.base.config import TrainHeadParams
 from pipeline.base.errors import ConfigError, ObservationError
 from pipeline.base.observation import Observation
+from pipeline.base.source import CLOCK_SLACK_S
 from pipeline.policy.anchoring import Anchoring
 from pipeline.policy.diffusion import DiffusionActionExpert
 from pipeline.policy.encoders import (
@@ -253,10 +254,11 @@ class Policy(Trainable):
             return encoder(values, valid, observation.feature_age, observation.view_age)
         ages = getattr(observation, AGES[stream])
         if stream == "state":
-            if self.shape.anchors:  # the older readings tell the motion since a frame
+            if self.params.anchored:  # the older readings tell the motion since a frame
                 newest = min(values.shape[1], self.params.state_window)
                 values, ages = values[:, -newest:], ages[:, -newest:]
-                valid = valid.clamp(max=newest)
+                oldest_s = (self.params.state_window_s or torch.inf) + CLOCK_SLACK_S
+                valid = valid.clamp(max=newest) - (ages > oldest_s).sum(dim=1)
             values = expand(values, self.shape.kinds)
         values = normalizer.normalize(values).clamp_(-_LARGEST, _LARGEST)
         return encoder(values, valid, ages).unsqueeze(1)

@@ -11,7 +11,7 @@ format does.
 import json
 import logging
 import warnings
-from collections.abc import Callable, Generator, Mapping
+from collections.abc import Callable, Generator, Iterable, Mapping
 from contextlib import contextmanager
 from importlib import import_module
 from importlib.metadata import version
@@ -95,12 +95,13 @@ def export_head(
     Nothing is written unless every file agrees with the policy. Raises `NumericsError` where one
     does not, `ConfigError` where packages are missing.
     """
-    check_packages(params)
+    packages = _PACKAGES if "onnx" in params.formats else ()
+    check_packages(packages, "export.formats", "export.formats=[torch]")
     policy = checkpoint.policy()
     head = Head(policy).eval().requires_grad_(False)
     given = golden_inputs(checkpoint, policy)
-    packages = ("torch", *(_PACKAGES if "onnx" in params.formats else ()))
-    written_by = {"opset": params.opset, "versions": {name: version(name) for name in packages}}
+    versions = {name: version(name) for name in ("torch", *packages)}
+    written_by = {"opset": params.opset, "versions": versions}
     contract = describe(checkpoint, folder, given["random"]) | written_by
     files: dict[str, Any] = {}
 
@@ -122,19 +123,19 @@ def export_head(
     return contract | {"files": files}
 
 
-def check_packages(params: ExportParams) -> None:
-    """Raise `ConfigError` where a package that a format needs is missing."""
+def check_packages(names: Iterable[str], key: str, without: str) -> None:
+    """Raise `ConfigError` where a package is missing that the param `key` needs."""
     missing: list[str] = []
-    for name in _PACKAGES if "onnx" in params.formats else ():
+    for name in names:
         try:
             import_module(name)
         except ImportError as error:
             missing.append(f"{name} ({error})")
     if missing:
         raise ConfigError(
-            f"export.formats: expected the packages of onnx, cannot load {', '.join(missing)}. Run "
-            "pip install 'vla-feature-cache[export]', in a checkout pip install -e '.[export]', or "
-            "set export.formats=[torch]."
+            f"{key}: expected the packages of onnx, cannot load {', '.join(missing)}. Run pip "
+            "install 'vla-feature-cache[export]', in a checkout pip install -e '.[export]', or set "
+            f"{without}."
         )
 
 
@@ -223,19 +224,21 @@ class ExportedHead:
                 f"{path}: expected the head of this checkpoint, found no such file. Run "
                 f"{command('export')} with onnx among export.formats."
             )
+        check_packages(("onnxruntime",), "rollout.head", "rollout.head=null")
         policy = checkpoint.policy()
         given = random_inputs(checkpoint, policy, ROWS)
-        self._run, self._names = onnx_runner(path, threads=1), [*given]
+        self._names, self._size = [*given], chunk_size(checkpoint)
         self._draws = given["noise"].shape[1] if "noise" in given else 0
-        self._size = chunk_size(checkpoint)
         try:
-            off = _furthest(self._run, Head(policy).eval(), given, checkpoint)[1]
+            self._run = onnx_runner(path, threads=1)
+            off = f"{(away := _furthest(self._run, Head(policy).eval(), given, checkpoint)[1]):g}"
         except Exception as error:  # the classes of ONNX Runtime's errors are its own
-            off = f"{type(error).__name__}: {error}"
-        if isinstance(off, str) or not off <= TOLERANCE:
+            off, away = f"{type(error).__name__}: {error}", np.inf
+        if not away <= TOLERANCE:
             raise CheckpointMismatch(
                 f"{path}: expected answers within {TOLERANCE:g} training std of the checkpoint's, "
-                f"found {off}. It is the head of another checkpoint: run {command('export')} again."
+                f"found {off}. It is damaged, or the head of another checkpoint: run "
+                f"{command('export')} again."
             )
 
     def act(

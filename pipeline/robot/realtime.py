@@ -32,6 +32,7 @@ from pipeline.robot.limits import Limits
 from pipeline.robot.loop import ControlLoop, SafeStop, StopKind
 from pipeline.robot.process import PolicyThread, Watchdog, ended_by_hand, stop_firmly, undisturbed
 from pipeline.robot.readings import PendingReadings, RobotClock
+from pipeline.robot.robot_memory import older_than_trained
 from pipeline.robot.run_report import (
     ANSWER_PARTS,
     MissedTick,
@@ -311,8 +312,9 @@ class _Run:
             self.recorder.answer(answer)
             self.timer.mark("plan")
         if answer.get("feature_age_s") is not None:
-            self.features_s = self.asked_s - float(answer["feature_age_s"])
-            self.report.old_features += answer["feature_age_s"] > self.trained_age_s
+            age_s = float(answer["feature_age_s"])
+            self.features_s = self.asked_s - age_s
+            self.report.old_features += older_than_trained(age_s, self.trained_age_s)
             if self.features_s >= self.frames_s - 1e-3:
                 self.loop.pass_ended()
         chunk = np.asarray(answer["actions"], np.float32)

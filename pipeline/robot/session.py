@@ -23,7 +23,7 @@ from pipeline.robot.chunking import PlanGuide
 from pipeline.robot.first_look import FirstLook
 from pipeline.robot.live_features import LiveFeatures, prove
 from pipeline.robot.observation import ObservationReader, RobotObservation
-from pipeline.robot.robot_memory import RobotMemory, SeenFeatures
+from pipeline.robot.robot_memory import RobotMemory, SeenFeatures, older_than_trained
 
 PROTOCOL = 1
 """Version of observations, answers and metadata."""
@@ -134,13 +134,13 @@ class ServedPolicy:
         return prompt
 
     def warn_of_age(self, age_s: float) -> None:
-        """Warn once of features that are older than training knows them, beyond clocks' noise."""
-        if age_s > 1.1 * self.metadata["trained_age_s"] and not self._age_told:
+        """Warn once of features that are older than those in training."""
+        if older_than_trained(age_s, self.metadata["trained_age_s"]) and not self._age_told:
             self._age_told = True
             self._say(
                 f"warning: features are {age_s:.2f} s old, and the policy was trained on at most "
-                f"{self.metadata['trained_age_s']:.2f} s: expect worse actions. Train with "
-                "train_head.anchor, or use a faster model."
+                f"{self.metadata['trained_age_s']:.2f} s. rollout.latency_ms simulates what that "
+                "does to it; a faster model helps."
             )
 
     def _pass(self, waiting: WaitingFrames) -> Pass:
@@ -199,7 +199,7 @@ class Session:
         """The answer to an observation: `actions` (horizon, action) in the units of the metadata.
 
         It also has `server_timing` in ms and, where the policy looks at features, `feature_age_s`,
-        `trained_age_s`, up to which training knows features, and `feature_key` (16,). Raises
+        `trained_age_s`, the oldest age in training, and `feature_key` (16,). Raises
         `ObservationError`, `NumericsError` and `VLMError`.
         """
         return self.answer(self.take(observation))

@@ -1,7 +1,7 @@
 """The one training loop: every expert, cached or live features, on one process or several."""
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import islice
 from pathlib import Path
@@ -42,7 +42,7 @@ from pipeline.train.run import TrainingRun, policy_shape
 from pipeline.train.sampling import Plan, StepPart
 from pipeline.train.scores import action_space, compare
 from pipeline.train.split import Split
-from pipeline.train.statistics import fit_normalization, resolve_anchor
+from pipeline.train.statistics import anchored_channels, fit_normalization
 from pipeline.train.training_data import source_of, split_parts
 
 LOG_EVERY = 10
@@ -68,7 +68,6 @@ class Trainer:
         run: TrainingRun,
         source: FeatureSource | None = None,
     ) -> None:
-        params = resolve_anchor(store, split.train, params)
         self.store, self.params, self.split, self.run = store, params, split, run
         self.processes = ProcessGroup.current()
         self.device = process_device(params.device)
@@ -97,9 +96,13 @@ class Trainer:
             self.stopping.best_error, self.stopping.stalled = state.best_error, state.stalled
             self.step, self._earlier, self._trained_s = state.step, state.rows, state.trained_s
         else:
-            fitted = partial(fit_normalization, store, split.train, self.windows)
+            # The state's encoder sees its own window, whatever else is gathered to anchor.
+            readings = min(params.state_window, self.windows.state_window)
+            own = {"state_window": readings, "state_window_s": params.state_window_s}
+            fitted = partial(fit_normalization, store, split.train, replace(self.windows, **own))
             self.normalization = self.processes.shared(fitted)
-            self.shape = policy_shape(store, self.normalization, tuple(params.anchor))
+            anchored = anchored_channels(store, split.train, params)
+            self.shape = policy_shape(store, self.normalization, anchored)
             self._build()
 
     def _build(self) -> None:

@@ -24,8 +24,9 @@ from pipeline.store import FeatureStore, place
 from pipeline.train.batches import Ticks, Windows, evenly
 
 CHUNK_BYTES = 64 * 2**20
-ONE_WAY = 0.5
-"""Mean over root mean square of the episodes' net motions from which they advance the same way."""
+ONE_WAY = 0.9
+"""A channel advances one way where the mean of its net motions in the episodes is at least this
+share of their root mean square."""
 _STATE_TICKS = 16_384
 """Training ticks at most whose windows give the statistics of the states."""
 _AT_ONCE = 1024
@@ -78,14 +79,15 @@ def fit_normalization(
     return Normalization(fitted["tick"], features, sensor, _fit_state(store, ticks, windows))
 
 
-def resolve_anchor(store: FeatureStore, ticks: Ticks, params: TrainHeadParams) -> TrainHeadParams:
-    """The params with the channels that `train_head.anchor: auto` means on the training `ticks`."""
+def anchored_channels(store: FeatureStore, ticks: Ticks, params: TrainHeadParams) -> list[str]:
+    """The action channels that `train_head.anchor` means on the training `ticks`."""
     if params.anchor != "auto":
-        return params
-    action, chosen = store.streams["action"], dict[str, int]()
-    enabled = params.features_enabled and params.robot_state_enabled
-    if enabled and store.feature_shape[0] and _readings(store, ticks, "state"):
-        chosen = told_deltas(action, store.streams["state"])
+        return [*params.anchor]
+    known = store.feature_shape[0] and _readings(store, ticks, "state")
+    if not (params.anchored and known):
+        return []
+    action = store.streams["action"]
+    chosen = told_deltas(action, store.streams["state"])
     groups = action_groups(action["names"], action["units"])
     one_way = np.zeros(len(groups), bool)
     if params.sensor_enabled and _readings(store, ticks, "sensor"):
@@ -94,8 +96,7 @@ def resolve_anchor(store: FeatureStore, ticks: Ticks, params: TrainHeadParams) -
         np.add.at(net, episode, store.array("tick/action")[ticks])
         one_way = np.abs(net.mean(axis=0)) >= ONE_WAY * np.sqrt(np.square(net).mean(axis=0))
     told = zip(action["names"], groups, one_way, strict=True)
-    anchor = [n for n, group, away in told if n in chosen and group == "translation" and not away]
-    return params.model_copy(update={"anchor": tuple(anchor)})
+    return [n for n, group, away in told if n in chosen and group == "translation" and not away]
 
 
 def _fit_state(store: FeatureStore, ticks: Ticks, windows: Windows) -> ChannelStatistics | None:

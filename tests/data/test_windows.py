@@ -111,3 +111,13 @@ def test_nan_is_named_by_window_and_reading():
     data[9, 4, 1] = np.nan
     with pytest.raises(RecordingError, match="nan in window 9, reading 4, channel 1"):
         rebuild(ends, data, 100.0, "x")
+
+
+@pytest.mark.parametrize("width", [2, 5])
+def test_one_shared_reading_contradicts_a_rate_too(width):
+    values, time = stream()
+    ends, data, stop = cut(values, time, width, width - 1)
+    with pytest.raises(RecordingError, match="must agree"):
+        rebuild(ends, data, 50.0, "x")
+    rebuilt_time, _ = rebuild(ends, data, 100.0, "x")
+    np.testing.assert_allclose(rebuilt_time, time[:stop], atol=1e-9)

@@ -295,7 +295,7 @@ def test_an_ensemble_leads_to_the_mean_of_the_places(monkeypatch: pytest.MonkeyP
     monkeypatch.setattr(InsertionEnvironment, "step", watched)
     rolled(parts, ablations=(), episodes=1, chunking="temporal")
     # Places: -0.1, then the mean of -0.2 (the first chunk) and -0.1 + 0.1 (the second).
-    weights = np.exp([0, -0.01])
+    weights = np.exp([0, 0.2])
     second = np.average([-0.2, 0.0], weights=weights) + 0.1
     assert [action[0] for action in sent[:2]] == pytest.approx([-0.1, second], abs=1e-6)
 

@@ -137,6 +137,22 @@ def test_a_policy_learns_and_answers_from_the_frame(
         torch.testing.assert_close(guided, count.from_tick(wanted, seen))
 
 
+def test_older_readings_tell_the_motion_and_nothing_else(
+    build_policy: Callable[..., Policy], observe: Callable[..., Any]
+) -> None:
+    policy = build_policy(state_window=8, state_window_s=0.3).eval()
+    seen = observe(2)
+    readings, within = seen.state.shape[1], (seen.state_age <= 0.3).sum(dim=1)
+    assert within.min() > 0 and within.max() < readings, "some are older than the window"
+    other = replace(seen, state=seen.state.clone())
+    for row, count in enumerate(within.tolist()):
+        other.state[row, : readings - min(count, 8)] += 5.0
+    assert not policy.shape.anchors, "so nothing counts from a frame here"
+    assert policy.act(other).equal(policy.act(seen))
+    other.state[:, -1] += 5.0
+    assert not policy.act(other).equal(policy.act(seen))
+
+
 def test_an_exported_head_counts_likewise(
     build_policy: Callable[..., Policy], observe: Callable[..., Any], shape: PolicyShape
 ) -> None:

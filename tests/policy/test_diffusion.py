@@ -237,8 +237,9 @@ def test_the_best_network_has_the_smallest_loss_there_is(
 
 
 def test_the_section_of_params_is_the_constructor() -> None:
-    expert = DiffusionActionExpert(dim=8, layers=1, heads=1, **DiffusionParams().model_dump())
+    params = DiffusionParams()
+    expert = DiffusionActionExpert(dim=8, layers=1, heads=1, **params.model_dump())
     assert expert.schedule.timesteps == 100
-    assert expert.prediction == DiffusionParams().prediction
-    assert expert.steps == expert.schedule.steps(10)
+    assert (expert.prediction, expert.draws) == (params.prediction, params.draws)
+    assert expert.steps == expert.schedule.steps(params.sampling_steps)
     torch.testing.assert_close(expert.schedule.alpha_bar, NoiseSchedule(100, "cosine").alpha_bar)

@@ -150,8 +150,8 @@ class TestTimes:
 def test_the_section_of_params_is_the_constructor() -> None:
     params = FlowMatchingParams().model_dump()
     expert = FlowMatchingActionExpert(dim=8, layers=1, heads=1, **params)
-    assert (expert.sampling_steps, expert.solver) == (10, "euler")
-    assert expert.draws == 4 and isinstance(expert.times, BetaTimes)
+    assert (expert.sampling_steps, expert.solver) == (params["sampling_steps"], "euler")
+    assert expert.draws == params["draws"] and isinstance(expert.times, BetaTimes)
     even = FlowMatchingActionExpert(dim=8, layers=1, heads=1, **params | {"time": "uniform"})
     drawn = torch.rand(10)
     assert torch.equal(even.times(drawn), drawn)

@@ -218,7 +218,7 @@ def test_every_format_is_the_policy(kind: dict[str, Any], export_of: Export) -> 
 @needs_onnx
 @pytest.mark.parametrize("kind", [REGRESSION, FLOW], ids=str)
 def test_an_exported_head_answers_for_its_policy_alone(
-    kind: dict[str, Any], export_of: Export
+    kind: dict[str, Any], export_of: Export, tmp_path: Path
 ) -> None:
     checkpoint, folder, _ = export_of(kind)
     head, policy = ExportedHead(folder, checkpoint), checkpoint.policy()
@@ -232,10 +232,13 @@ def test_an_exported_head_answers_for_its_policy_alone(
     expected = policy.act(observation, drawn())
     torch.testing.assert_close(head.act(observation, drawn()), expected, rtol=0, atol=2e-5)
     other = checkpoint_of(**DIFFUSION)
-    with pytest.raises(CheckpointMismatch, match="It is the head of another checkpoint"):
+    with pytest.raises(CheckpointMismatch, match="the head of another checkpoint"):
         ExportedHead(folder, other)
     with pytest.raises(CheckpointMismatch, match=r"none/head\.onnx: .* found no such file"):
         ExportedHead(folder / "none", checkpoint)
+    (tmp_path / "head.onnx").write_bytes(b"cut off")
+    with pytest.raises(CheckpointMismatch, match="It is damaged"):
+        ExportedHead(tmp_path, checkpoint)
 
 
 @pytest.mark.parametrize(

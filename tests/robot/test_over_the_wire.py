@@ -59,13 +59,14 @@ def test_the_same_seed_gives_the_same_episode_bit_for_bit(
         assert (getattr(wired.episodes[0].trace, name) == values).all(), name
 
 
+@pytest.mark.parametrize("execute", [2, 4])
 def test_several_steps_of_a_chunk_are_played_between_two_questions(
-    served_policy: Served, serving: Served
+    execute: int, served_policy: Served, serving: Served
 ) -> None:
     served = served_policy()
-    wired = over_the_wire(served, serving, execute=4)
+    wired = over_the_wire(served, serving, execute=execute)
     steps = wired.of("policy")[0].ticks - 1  # the first tick is over when the episode begins
-    # Frames go along with every question then: more than `vlm_reuse_count` ticks lie between.
+    # Frames go along with a question once `vlm_reuse_count` ticks lie between: every fourth tick.
     assert len(served.glance.passes) == -(-steps // 4)
 
 

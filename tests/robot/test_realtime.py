@@ -137,6 +137,15 @@ def stopped(
     return report
 
 
+def test_a_report_counts_features_older_than_in_training() -> None:
+    brain = Brain(
+        lambda n, answer: answer.update(feature_age_s=0.5 if n in (3, 4) else 0.3),
+        trained_age_s=0.3,
+    )
+    report = run_robot(Arm(), brain, replace(CALM, seconds=2.0))
+    assert len(brain.asked) > 4 and report.old_features == 2
+
+
 def after(tick: int, do: Callable[[Observed], Any]) -> Callable[[int, Observed], None]:
     """From this tick on."""
     return lambda now, observed: do(observed) if now >= tick else None

@@ -15,7 +15,7 @@ from pipeline.policy.attention import right_aligned
 from pipeline.store import FeatureStore
 from pipeline.store.chunks import write_seal
 from pipeline.train.batches import Windows
-from pipeline.train.statistics import fit_normalization, resolve_anchor
+from pipeline.train.statistics import anchored_channels, fit_normalization
 
 Patch = pytest.MonkeyPatch
 Make = Callable[..., Any]
@@ -139,12 +139,12 @@ def test_threads_change_no_bit(
 @pytest.mark.parametrize(
     ("changed", "anchor"),
     [
-        ({}, ("dx",)),  # all episodes go down dz, whose depth the sensor tells
-        ({"sensor_enabled": False}, ("dx", "dz")),
-        ({"robot_state_enabled": False}, ()),
-        ({"features_enabled": False}, ()),
-        ({"anchor": ["dz"]}, ("dz",)),
-        ({"anchor": "none"}, ()),
+        ({}, ["dx"]),  # all episodes go down dz, whose depth the sensor tells
+        ({"sensor_enabled": False}, ["dx", "dz"]),
+        ({"robot_state_enabled": False}, []),
+        ({"features_enabled": False}, []),
+        ({"anchor": ["dz"]}, ["dz"]),
+        ({"anchor": "none"}, []),
     ],
 )
 def test_anchored_are_translations_that_go_either_way(
@@ -157,7 +157,7 @@ def test_anchored_are_translations_that_go_either_way(
     action, episode = store.array("tick/action"), store.episode_of(np.arange(store.ticks))
     action[:, 0], action[:, 2] = np.where(episode % 2, 1.0, -1.0), 1.0
     params = TrainHeadParams.model_validate(changed)
-    assert resolve_anchor(store, np.arange(store.ticks), params).anchor == anchor
+    assert anchored_channels(store, np.arange(store.ticks), params) == anchor
 
 
 def test_what_rested_in_training_is_no_unit_of_what_moves_later(

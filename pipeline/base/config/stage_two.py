@@ -114,8 +114,8 @@ class TrainHeadParams(Section):
     anchor: Literal["auto"] | tuple[str, ...] = "auto"
     """Action channels that count from where the arm was when the newest frame was taken, such as
     `[dx, dy]`: what vision tells stays true when the model is late. They are deltas whose motion
-    the state tells. `auto` takes the translations among them; with a sensor, not those in which all
-    training episodes advance the same way, for the sensor tells their depth. none: no channel."""
+    the state tells. `auto` takes the translations among them; with a sensor, not those in which the
+    training episodes advance one way, because the sensor sees how far. none: no channel."""
     anchor_s: float = Field(default=2.0, gt=0, le=3600)
     """Seconds back that the motion since a frame is known; a frame that is older counts as so old.
     """
@@ -206,7 +206,7 @@ class TrainHeadParams(Section):
 
     @model_validator(mode="after")
     def _anchor_has_what_it_needs(self) -> "TrainHeadParams":
-        if self.anchored and not (self.features_enabled and self.robot_state_enabled):
+        if self.anchor not in ("auto", ()) and not self.anchored:
             raise ValueError(
                 "anchor counts from the newest frame by the state's motion: enable features and "
                 "robot state, or set anchor to none"
@@ -215,8 +215,8 @@ class TrainHeadParams(Section):
 
     @property
     def anchored(self) -> bool:
-        """Whether channels are anchored; `auto` anchors none before training has chosen them."""
-        return self.anchor not in ("auto", ())
+        """Whether channels may be anchored; which ones `auto` means, the policy's shape says."""
+        return self.anchor != () and self.features_enabled and self.robot_state_enabled
 
     @property
     def sensor_reach_s(self) -> float | None:
@@ -231,11 +231,8 @@ class TrainHeadParams(Section):
         return max(self.state_window_s, self.anchor_s)
 
     def trained_age_s(self, reuse_s: float) -> float:
-        """Up to which age training knows features that serve ticks for `reuse_s` each.
-
-        Anchored, a frame stays true for as long as the motion since then is known.
-        """
-        return self.anchor_s if self.anchored else reuse_s * (1 + self.feature_lag)
+        """The oldest age of features in training, where each row serves ticks for `reuse_s`."""
+        return reuse_s * (1 + self.feature_lag)
 
     @property
     def state_readings(self) -> int:
@@ -322,6 +319,8 @@ class RolloutParams(Section):
     def _one_answers(self) -> "RolloutParams":
         if self.head is not None and self.server is not None:
             raise ValueError("head and server: either an exported head answers or a server does")
+        if self.head is not None and self.chunking == "rtc":
+            raise ValueError("head: an exported head cannot be guided: set chunking to temporal")
         return self
 
 
