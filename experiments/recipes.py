@@ -224,7 +224,7 @@ RECIPES = {
     "somewhat late in training": Recipe(
         ("train_head.feature_lag=1", "train_head.sensor_lag_s=0.05")
     ),
-    "rotations anchored": Recipe(("train_head.anchor=[dx, dy, rx, ry, rz]",)),
+    "rotations anchored": Recipe(("train_head.anchor=[dx, dy, da, db, dr]",)),
     "depth anchored": Recipe(("train_head.anchor=[dx, dy, dz]",)),
     "state dropped": Recipe(("train_head.drop_state=0.8",)),
     "not averaged": Recipe(("train_head.ema_decay=0.0",)),

@@ -33,7 +33,8 @@ _SUCCESS = (
 _CONTROLLERS = (
     "The demonstrator is the rule that made the training data, and sees what the simulation hides. "
     "With a stream off, the same policy sees its training mean; with one frozen, its first reading "
-    "forever. All of them meet the same episodes."
+    "forever; a state that is spoilt tells no motion since the frame, either. Late is the policy "
+    "with a model that takes so long for a pass. All of them meet the same episodes."
 )
 _MOMENTS = 8
 _NEAR_MM = 3.0
