@@ -148,10 +148,15 @@ def load_policy(folder: Path) -> PolicyCheckpoint:
 
     Raises `CheckpointIncomplete` naming the file that is missing, truncated or altered.
     """
+    import torch
+
     document, content = read_document(folder / DOCUMENT, PolicyDocument)
     path = folder / WEIGHTS
-    weights = read_tensors(path, document.weights_sha256)
-    _check_tensors(path, weights, _described_weights(folder, document))
+    described = _described_weights(folder, document)
+    # Of training alone, and absent from policies that were trained before it was there.
+    direct = {n: torch.zeros(shape) for n, (_, shape) in described.items() if ".direct." in n}
+    weights = direct | dict(read_tensors(path, document.weights_sha256))
+    _check_tensors(path, weights, described)
     return PolicyCheckpoint(
         params=document.params.train_head,
         shape=document.shape,

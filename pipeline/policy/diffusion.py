@@ -10,31 +10,28 @@ from torch import Generator
 from pipeline.policy.attention import Projected
 from pipeline.policy.denoiser import Denoiser
 from pipeline.policy.expert import (
-    ActionExpert,
     Chunk,
     Context,
+    DrawingExpert,
     Generators,
     Guide,
     Losses,
     StepMask,
     gain,
     pull,
-    repeated,
     standard_normal,
     uniform,
 )
 from pipeline.policy.noise_schedule import NoiseSchedule, Prediction, ScheduleKind
 
 
-class DiffusionActionExpert(ActionExpert):
+class DiffusionActionExpert(DrawingExpert):
     """A denoising diffusion model of the chunk given the context.
 
     `sampler` ddpm visits every step of the schedule; ddim visits `sampling_steps` of them, with
     `eta` from 0 (nothing random but the first noise) to 1 (as random as ddpm). In each the
     predicted clean chunk is held within +-`clip`, and the step is taken from the chunk so held.
     """
-
-    stochastic = True
 
     def __init__(
         self,
@@ -56,9 +53,8 @@ class DiffusionActionExpert(ActionExpert):
         groups: Sequence[str] | None = None,
         group_weights: Mapping[str, float] | None = None,
     ) -> None:
-        super().__init__(horizon, action_dim, groups, group_weights, "mse")
+        super().__init__(horizon, action_dim, dim, draws, groups, group_weights)
         self.prediction: Prediction = prediction
-        self.draws = draws
         self.sampler, self.eta, self.clip = sampler, eta, clip
         self.schedule = NoiseSchedule(timesteps, schedule)
         self.steps = self.schedule.steps(timesteps if sampler == "ddpm" else sampling_steps)
@@ -67,18 +63,20 @@ class DiffusionActionExpert(ActionExpert):
             dropout=dropout,
         )  # fmt: skip
 
-    def loss(
-        self, context: Context, actions: Chunk, valid: StepMask, generator: Generator | None = None
+    def drawn_loss(
+        self, context: Context, chunk: Chunk, valid: StepMask, generator: Generator | None
     ) -> Losses:
-        """The grouped squared error of the prediction at uniform steps, `draws` a chunk."""
-        context, actions, valid = repeated(self.draws, context, actions, valid)
-        sample = actions.float().masked_fill(~valid.unsqueeze(-1), 0.0)
-        epsilon = standard_normal(sample.shape, sample.device, generator)
-        drawn = uniform(len(sample), sample.device, generator)
-        step = 1 + (drawn * self.schedule.timesteps).long()
-        noisy = self.schedule.add_noise(sample, epsilon, step)
+        """The grouped squared error of the prediction at drawn steps.
+
+        A step of the schedule is drawn in proportion to its number: noisy ones, which tell the way
+        from the context, more often than those that are nearly clean.
+        """
+        epsilon = standard_normal(chunk.shape, chunk.device, generator)
+        drawn = uniform(len(chunk), chunk.device, generator).sqrt()
+        step = 1 + (drawn * self.schedule.timesteps).long().clamp(max=self.schedule.timesteps - 1)
+        noisy = self.schedule.add_noise(chunk, epsilon, step)
         predicted = self.denoiser(noisy, step / self.schedule.timesteps, context, valid)
-        target = self.schedule.target(self.prediction, sample, epsilon, step)
+        target = self.schedule.target(self.prediction, chunk, epsilon, step)
         return self.grouped(predicted, target, valid)
 
     @torch.no_grad()

@@ -151,9 +151,45 @@ class GroupedLoss(nn.Module):
         return (means * self.weights).sum(), parts
 
 
-def repeated(times: int, *batch: Tensor) -> tuple[Tensor, ...]:
-    """The tensors of a batch, each repeated as a whole along its first axis."""
-    return tuple(x.repeat(times, *[1] * (x.ndim - 1)) for x in batch)
+class DrawingExpert(ActionExpert):
+    """An expert that draws its chunks, and learns from `draws` noises a chunk at once.
+
+    In training alone a linear layer, `direct`, also predicts the chunk from the context's mean: so
+    the context soon tells what the chunk depends on, which noise hides at first. The loss has half
+    of its squared error besides.
+    """
+
+    stochastic = True
+
+    def __init__(
+        self,
+        horizon: int,
+        action_dim: int,
+        dim: int,
+        draws: int,
+        groups: Sequence[str] | None,
+        group_weights: Mapping[str, float] | None,
+    ) -> None:
+        super().__init__(horizon, action_dim, groups, group_weights, "mse")
+        self.draws = draws
+        self.direct = nn.Linear(dim, horizon * action_dim)
+
+    def loss(
+        self, context: Context, actions: Chunk, valid: StepMask, generator: Generator | None = None
+    ) -> Losses:
+        """The loss of `draws` noises a chunk and that of `direct`; the parts are of the noises."""
+        chunk = actions.float().masked_fill(~valid.unsqueeze(-1), 0.0)
+        direct = self.direct(context.mean(dim=1)).unflatten(-1, chunk.shape[1:])
+        guessed = self.grouped(direct, chunk, valid)[0]
+        context, chunk = (x.repeat(self.draws, 1, 1) for x in (context, chunk))
+        drawn, parts = self.drawn_loss(context, chunk, valid.repeat(self.draws, 1), generator)
+        return drawn + guessed / 2, parts
+
+    @abstractmethod
+    def drawn_loss(
+        self, context: Context, chunk: Chunk, valid: StepMask, generator: Generator | None
+    ) -> Losses:
+        """The loss of one noise a chunk; steps that are not valid are 0."""
 
 
 def standard_normal(

@@ -9,16 +9,15 @@ from torch import Generator, Tensor, nn
 
 from pipeline.policy.denoiser import Denoiser
 from pipeline.policy.expert import (
-    ActionExpert,
     Chunk,
     Context,
+    DrawingExpert,
     Generators,
     Guide,
     Losses,
     StepMask,
     gain,
     pull,
-    repeated,
     standard_normal,
     uniform,
 )
@@ -74,7 +73,7 @@ class BetaTimes(nn.Module):
         return 1 - torch.lerp(self.quantiles[below], self.quantiles[below + 1], place - below)
 
 
-class FlowMatchingActionExpert(ActionExpert):
+class FlowMatchingActionExpert(DrawingExpert):
     """Conditional flow matching of the chunk given the context, on straight paths.
 
     Noise at t = 0 and the chunk at t = 1 are joined by x_t = (1 - t) noise + t chunk (Lipman et
@@ -82,8 +81,6 @@ class FlowMatchingActionExpert(ActionExpert):
     and `act` follows it in `sampling_steps` steps of `solver`. `time` says how t is drawn in the
     loss: uniform, or with a noise share 1 - t of Beta(`alpha`, `beta`) (pi0, Black et al. 2024).
     """
-
-    stochastic = True
 
     def __init__(
         self,
@@ -103,8 +100,8 @@ class FlowMatchingActionExpert(ActionExpert):
         groups: Sequence[str] | None = None,
         group_weights: Mapping[str, float] | None = None,
     ) -> None:
-        super().__init__(horizon, action_dim, groups, group_weights, "mse")
-        self.draws, self.sampling_steps = draws, sampling_steps
+        super().__init__(horizon, action_dim, dim, draws, groups, group_weights)
+        self.sampling_steps = sampling_steps
         self.solver: Solver = solver
         self.times = BetaTimes(alpha, beta) if time == "beta" else nn.Identity()
         self.denoiser = Denoiser(
@@ -112,12 +109,10 @@ class FlowMatchingActionExpert(ActionExpert):
             dropout=dropout,
         )  # fmt: skip
 
-    def loss(
-        self, context: Context, actions: Chunk, valid: StepMask, generator: Generator | None = None
+    def drawn_loss(
+        self, context: Context, chunk: Chunk, valid: StepMask, generator: Generator | None
     ) -> Losses:
-        """The grouped squared error of the velocity at drawn times, `draws` a chunk."""
-        context, actions, valid = repeated(self.draws, context, actions, valid)
-        chunk = actions.float().masked_fill(~valid.unsqueeze(-1), 0.0)
+        """The grouped squared error of the velocity at drawn times."""
         noise = standard_normal(chunk.shape, chunk.device, generator)
         time = self.times(uniform(len(chunk), chunk.device, generator))
         share = time.view(-1, 1, 1)

@@ -138,7 +138,7 @@ class TestTimes:
         generator, count = torch.Generator().manual_seed(0), 100_000
         chunk, valid = gaussian.draw(count, generator), torch.ones(count, 1, dtype=torch.bool)
         expert = optimal(gaussian, time=time)
-        loss, _ = expert.loss(torch.zeros(count, 1, 8), chunk, valid, generator)
+        loss, _ = expert.drawn_loss(torch.zeros(count, 1, 8), chunk, valid, generator)
         share = beta_distribution(1.5, 1.0) if time == "beta" else beta_distribution(1, 1)
 
         def weighed(t: float) -> float:
