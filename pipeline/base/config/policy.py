@@ -70,8 +70,7 @@ class DiffusionParams(Section):
     schedule: Literal["cosine", "linear"] = "cosine"
     """How the noise grows over them."""
     prediction: Literal["epsilon", "sample", "v"] = "sample"
-    """What the network predicts: the noise, the clean chunk, which inserts most often on the demo,
-    or the velocity between them."""
+    """What the network predicts: the noise, the clean chunk, or the velocity between them."""
     sampler: Literal["ddpm", "ddim"] = "ddim"
     """`ddpm` takes every step of the schedule, `ddim` as many as `sampling_steps`."""
     sampling_steps: int = Field(default=4, ge=1, le=10_000)
