@@ -267,7 +267,7 @@ TABLES = {
     "spoilt": Table((AS_IT_IS,), ("spoilt",)),
     "checkpoint": Table((AS_IT_IS,), (ON_TIME, "last weights")),
     "levels": Table((AS_IT_IS, "300 demonstrations"), (ON_TIME, "depth", "moved")),
-    "latency": Table((AS_IT_IS, "late in training", NOT_ANCHORED), _LATER),
+    "latency": Table((AS_IT_IS, "late in training"), _LATER),
     "before": Table((NOT_ANCHORED,), _AS_BEFORE),
     "moved": Table((AS_IT_IS,), ("moved", *(f"moved, {late}" for late in LATE))),
     "anchors": Table((AS_IT_IS, "rotations anchored", "depth anchored"), (ON_TIME, "600 ms")),

@@ -15,12 +15,15 @@ from pipeline.base.arrays import first_non_finite
 from pipeline.base.errors import ObservationError
 from pipeline.base.source import CLOCK_SLACK_S
 from pipeline.robot.chunking import PlanGuide
+from pipeline.robot.key_maps import KeyMap
 
 LONGEST_PROMPT: Final = 1000
 """Characters of an instruction."""
 LARGEST_SEED: Final = 2**63
 
 STREAMS: Final = ("state", "sensor")
+_STILL: Final = 10
+_HINT: Final = ". For a client with openpi's names of a robot set serve.transform on the server"
 
 
 @dataclass(frozen=True)
@@ -51,9 +54,11 @@ class ObservationReader:
     A refused observation changes nothing.
     """
 
-    def __init__(self, metadata: Mapping[str, Any]) -> None:
+    def __init__(self, metadata: Mapping[str, Any], key_map: KeyMap | None = None) -> None:
+        """`key_map` translates the names of a known robot's client."""
         streams = metadata["streams"]
         self._views: Sequence[str] = streams["views"]
+        self._key_map = key_map
         self._chunk = (metadata["horizon"], metadata["action_dim"])
         widths = {name: len(streams.get(name, {}).get("names", ())) for name in STREAMS}
         self._widths = {name: width for name, width in widths.items() if width}
@@ -68,14 +73,18 @@ class ObservationReader:
         """The observation of these fields. Raises `ObservationError`.
 
         `time` defaults to the newest time among the fields, else to this machine's clock. A frame
-        or a single reading without a time has `time`.
+        or a single reading without a time has `time`. Fields may be nested: `images` with views.
         """
         if not isinstance(given, Mapping):
             raise ObservationError(f"expected fields by name, found {type(given).__name__}")
+        given = _flat(given)
+        if self._key_map is not None:
+            given = self._key_map.apply(given, self._views)
         if unknown := [str(name) for name in given if name not in self._known]:
             known = ", ".join(self._known)
+            hint = "" if self._key_map or "observation/" not in unknown[0] else _HINT
             raise ObservationError(
-                f"{unknown[0]:.80}: expected one of {known}, which this policy takes"
+                f"{unknown[0]:.80}: expected one of {known}, which this policy takes{hint}"
             )
         reset, seed = _reset(given.get("reset", False))
         values = self._values(given)
@@ -160,12 +169,61 @@ class ObservationReader:
         return PlanGuide(chunk, weight)
 
 
+class Doubts:
+    """What cannot be true of the observations of an episode, each told once.
+
+    A frame of one value, a state of zeros, and a picture that `_STILL` frames in a row repeat to
+    the bit, which no camera does that runs.
+    """
+
+    def __init__(self) -> None:
+        self._told = set[str]()
+        self._last = dict[str, NDArray[np.uint8]]()
+        self._still = dict[str, int]()
+
+    def of(self, observation: RobotObservation) -> list[str]:
+        """The new doubts about an observation, in words."""
+        doubts: dict[str, str] = {}
+        for view, frame in observation.frames.items():
+            name, last = f"images/{view}", self._last.get(view)
+            if frame.min() == frame.max():
+                doubts[name] = (
+                    f"{name}: every pixel is {frame.min()}: is the camera covered or off?"
+                )
+            same = last is not None and np.array_equal(last, frame)
+            self._still[view] = self._still.get(view, 1) + 1 if same else 1
+            self._last[view] = frame
+            if self._still[view] >= _STILL:
+                doubts[f"{name} still"] = (
+                    f"{name}: {_STILL} frames in a row are the same picture: does the camera run?"
+                )
+        state = observation.readings.get("state")
+        if state is not None and not state.any():
+            doubts["state"] = "state: every channel is exactly 0: is it read from the robot?"
+        new = [text for name, text in doubts.items() if name not in self._told]
+        self._told |= doubts.keys()
+        return new
+
+
+def _flat(given: Mapping[Any, Any]) -> dict[Any, Any]:
+    """The fields with those of nested mappings: `{"images": {"a": x}}` as `{"images/a": x}`."""
+    flat: dict[Any, Any] = {}
+    for name, value in given.items():
+        inner = value if isinstance(value, Mapping) else {None: value}
+        for key, own in inner.items():
+            place = name if key is None else f"{name}/{key}"
+            if place in flat:
+                raise ObservationError(f"{place:.80}: expected it once, found it twice")
+            flat[place] = own
+    return flat
+
+
 def _numbers(
     name: str, value: Any, axes: Sequence[int | str], dtype: type[np.floating[Any]]
 ) -> NDArray[Any]:
     """The value as finite numbers of this dtype; an axis with only a name has any length.
 
-    A single number may come without an axis.
+    A single number, and a single reading, may come without the first axis.
     """
     try:
         array = np.asarray(value)
@@ -173,7 +231,8 @@ def _numbers(
         array = np.empty(0, object)
     if array.dtype.kind not in "biuf":
         raise ObservationError(f"{name}: expected numbers, found {type(value).__name__}")
-    array = array.reshape(1) if axes == (1,) and array.ndim == 0 else array
+    if array.shape == tuple(axes[1:]) and axes[0] in (1, "reading"):
+        array = array[None]
     fits = array.ndim == len(axes) and all(
         isinstance(size, str) or have == size for have, size in zip(array.shape, axes, strict=True)
     )

@@ -363,9 +363,23 @@ class _Run:
         self.frames_s = max(frames[view][0] for view in self.views)
         return fields
 
+    def _answer_times(self) -> str:
+        """How long answers took, beside how long they may take."""
+        took = self.report.answer_timings.document().get(ANSWER_PARTS[0])
+        if took is None:
+            return ""
+        allowed_ms = 500 * self.loop.executor.horizon / self.hz
+        return (
+            f": answers took {took['p50']:.0f} ms (median), {took['max']:.0f} ms at most; half of "
+            f"a chunk is {allowed_ms:.0f} ms"
+        )
+
     def act(self, tick: int, observed: Mapping[str, Any]) -> None:
         """Send this tick's action within the limits; nothing before the first chunk."""
-        action = self.loop.action()
+        try:
+            action = self.loop.action()
+        except SafeStop as stop:
+            raise SafeStop(stop.kind, f"{stop}{self._answer_times()}") from None
         if action is not None:
             age_s = self.now_s - self.features_s if self.views else 0.0
             if not age_s <= self.settings.old_features_s:

@@ -8,22 +8,20 @@ and the connection is closed. After `busy: …` it stays open.
 import asyncio
 import hmac
 import ipaddress
-import json
 import logging
-import math
 import os
 import signal
 import socket
 import sys
 import threading
 import traceback
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, suppress
 from functools import partial
 from http import HTTPStatus
 from time import monotonic
-from typing import Any, Final
+from typing import Final, cast
 from urllib.parse import urlsplit
 
 from websockets.asyncio.server import Server, ServerConnection, serve
@@ -37,14 +35,12 @@ from pipeline.base.config import ServeParams
 from pipeline.base.errors import ConfigError, ObservationError, PipelineError, WireError
 from pipeline.robot import wire
 from pipeline.robot.client import TOKEN_VARIABLE
-from pipeline.robot.run_report import Timings
+from pipeline.robot.key_maps import KEY_MAPS
+from pipeline.robot.server_status import Event, ServerStatus
 from pipeline.robot.session import ServedPolicy, Session
 
 CLOSING_S: Final = 30.0
 """How long an unanswered observation may keep the server from closing."""
-_TIMED: Final = ("vlm_ms", "head_ms", "wait_ms", "infer_ms")
-_KEPT: Final = 5000
-"""Newest answers whose latencies are kept."""
 
 
 def read_token(params: ServeParams) -> str | None:
@@ -95,32 +91,6 @@ def listen(params: ServeParams) -> socket.socket:
         return bound
 
 
-class ServerStatus:
-    """Counts and latencies of a server's answers, and what it serves."""
-
-    def __init__(self, metadata: Mapping[str, Any]) -> None:
-        self.connected = self.refused = self.busy = 0
-        shown = ("checkpoint", "step", "model_type", "action_hz", "feature_spec_digest")
-        self._policy = {name: metadata[name] for name in shown}
-        self._timings, self._since_s = Timings(_TIMED, _KEPT), monotonic()
-        self._lock = threading.Lock()
-
-    def answered(self, timing: Mapping[str, float]) -> None:
-        """Note the `server_timing` of an answer, from any thread; a part of 0 ms did not happen."""
-        with self._lock:
-            self._timings.note([timing[part] or math.nan for part in _TIMED])
-
-    def json(self) -> str:
-        """The content of `/status.json`."""
-        with self._lock:
-            answered, latency = self._timings.count, self._timings.document()
-        counts = {"connected": self.connected, "answered": answered}
-        counts |= {"refused": self.refused, "busy": self.busy}
-        seconds = monotonic() - self._since_s
-        document = {"policy": self._policy, "seconds": seconds, "counts": counts}
-        return json.dumps(document | {"latency": latency})
-
-
 class PolicyServer:
     """Serves a policy until `stop`, Ctrl-C or SIGTERM."""
 
@@ -137,7 +107,14 @@ class PolicyServer:
         self._socket = bound
         host, port = bound.getsockname()[:2]
         self.address = f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
-        self.status = ServerStatus(served.metadata)
+        self.status = ServerStatus(served.metadata, say, params.log)
+        self._key_map = None if params.transform is None else KEY_MAPS[params.transform]
+        if self._key_map is not None:
+            self._key_map.refuse_more(served.metadata["streams"]["views"])
+        self._metadata = served.metadata | {"transform": params.transform}
+        metadata = served.metadata
+        self._allowed_ms = 500 * metadata["horizon"] / metadata["action_hz"]
+        """Of an answer: half of a chunk, after which a robot's plan soon ends."""
         # One thread a robot, which has at most one unanswered observation.
         self._threads = ThreadPoolExecutor(params.max_connections, "robot")
         self._answering = 0
@@ -197,14 +174,20 @@ class PolicyServer:
         """One robot, from its metadata to its last answer."""
         # Counted until its last observation is answered, which may be after it has left.
         self.status.connected += 1
+        robot, answers, since_s = _address(connection), 0, monotonic()
+        self.status.note("connected", robot)
         try:
-            await connection.send(wire.pack(self._served.metadata))
-            session = self._served.session(self._params.fresh, self._params.seed)
+            await connection.send(wire.pack(self._metadata))
+            session = self._served.session(self._params.fresh, self._params.seed, self._key_map)
             code = None
             while code is None and not self._stopping:
                 message = await self._next(connection)
-                answer, code = await self._answer(message, session)
+                answer, code = await self._answer(message, session, robot)
                 del message
+                if isinstance(answer, str):
+                    event, _, why = answer.partition(": ")
+                    self.status.note(cast("Event", event), robot, why)
+                answers += isinstance(answer, bytes)
                 await connection.send(answer)
             if code is None:
                 await _leave(connection)
@@ -215,6 +198,8 @@ class PolicyServer:
             pass  # The robot has left, or sends nothing.
         finally:
             self.status.connected -= 1
+            seconds = monotonic() - since_s
+            self.status.note("left", robot, f"{answers} answers in {seconds:.1f} s", robot)
 
     async def _next(self, connection: ServerConnection) -> str | bytes:
         """The next message; closes a connection that sends none."""
@@ -230,7 +215,7 @@ class PolicyServer:
             self._idle.discard(connection)
 
     async def _answer(
-        self, message: str | bytes, session: Session
+        self, message: str | bytes, session: Session, robot: str
     ) -> tuple[str | bytes, int | None]:
         """The answer to a message, and the code to close the connection with; None to go on."""
         if isinstance(message, str):
@@ -239,7 +224,7 @@ class PolicyServer:
         loop, busy = asyncio.get_running_loop(), self._answering >= self._params.max_waiting
         self._answering += 1
         try:
-            work = (self._think, message, session, busy)
+            work = (self._think, message, session, robot, busy)
             return await loop.run_in_executor(self._threads, *work), None
         except WireError as error:
             return f"refused: {_line(error)}", CloseCode.INVALID_DATA
@@ -254,15 +239,22 @@ class PolicyServer:
         finally:
             self._answering -= 1
 
-    def _think(self, message: bytes, session: Session, busy: bool) -> str | bytes:
+    def _think(self, message: bytes, session: Session, robot: str, busy: bool) -> str | bytes:
         """The answer to a message, in a thread of its own."""
         observation = session.take(wire.unpack(message, self._params.max_message_mb * 2**20))
         if busy:
             self.status.busy += 1
             waiting = self._params.max_waiting
             return f"busy: {waiting} observations are waiting; the readings were taken"
+        if observation.reset:
+            self.status.note("episode", robot, observation.prompt or "", robot)
         answer = session.answer(observation)
         self.status.answered(answer["server_timing"])
+        for warning in answer.get("warnings", ()):
+            self.status.note("warning", robot, warning)
+        if (spent_ms := answer["server_timing"]["infer_ms"]) > self._allowed_ms:
+            half = f"half of a chunk is {self._allowed_ms:.0f} ms"
+            self.status.note("slow", robot, f"an answer took {spent_ms:.0f} ms, {half}", "")
         if "feature_key" in answer:
             # Bytes, not an array: openpi's chunk broker takes every array for one of steps.
             answer["feature_key"] = answer["feature_key"].tobytes()
@@ -271,6 +263,11 @@ class PolicyServer:
     async def _respond(self, connection: ServerConnection, request: Request) -> Response | None:
         """The answer to an HTTP request; None where it opens a websocket."""
         headers, say = request.headers, partial(_response, connection)
+
+        def turn_away(status: HTTPStatus, why: str, **headers: str) -> Response:
+            self.status.note("turned away", _address(connection), why)
+            return say(status, f"{why}\n", **headers)
+
         try:
             path, foreign = urlsplit(request.path).path, self._is_foreign(headers)
             authorized = self._authorized(headers)
@@ -289,10 +286,10 @@ class PolicyServer:
                     f"expected Host localhost, found {shown(headers.get('Host'))}: by other names "
                 )
                 why += "only a server with a token is asked (serve.token_file)"
-            return say(HTTPStatus.FORBIDDEN, f"{why}\n")
+            return turn_away(HTTPStatus.FORBIDDEN, why)
         if not authorized:
-            why = "expected the header Authorization: Api-Key <the server's token>\n"
-            return say(HTTPStatus.UNAUTHORIZED, why, **{"WWW-Authenticate": "Api-Key"})
+            why = "expected the header Authorization: Api-Key <the server's token>"
+            return turn_away(HTTPStatus.UNAUTHORIZED, why, **{"WWW-Authenticate": "Api-Key"})
         if path == "/status.json":
             kind = {"Content-Type": "application/json"}
             return say(HTTPStatus.OK, self.status.json(), **kind)
@@ -302,8 +299,8 @@ class PolicyServer:
         most = self._params.max_connections
         if self.status.connected < most:
             return None
-        why = f"busy: {most} robots are connected (serve.max_connections)\n"
-        return say(HTTPStatus.SERVICE_UNAVAILABLE, why)
+        why = f"busy: {most} robots are connected (serve.max_connections)"
+        return turn_away(HTTPStatus.SERVICE_UNAVAILABLE, why)
 
     def _is_foreign(self, headers: Headers) -> bool:
         """Whether a web page asks, through a browser on this machine.
@@ -328,6 +325,11 @@ def _response(
         response.headers.pop(name, None)
         response.headers[name] = value
     return response
+
+
+def _address(connection: ServerConnection) -> str:
+    host, port, *_ = connection.remote_address or ("unknown", 0)
+    return f"{host}:{port}"
 
 
 async def _leave(connection: ServerConnection) -> None:

@@ -21,8 +21,9 @@ from pipeline.policy.observation import moving_channels
 from pipeline.policy.policy import Policy
 from pipeline.robot.chunking import PlanGuide
 from pipeline.robot.first_look import FirstLook
+from pipeline.robot.key_maps import KeyMap
 from pipeline.robot.live_features import LiveFeatures, prove
-from pipeline.robot.observation import ObservationReader, RobotObservation
+from pipeline.robot.observation import Doubts, ObservationReader, RobotObservation
 from pipeline.robot.robot_memory import RobotMemory, SeenFeatures, older_than_trained
 
 PROTOCOL = 1
@@ -83,13 +84,16 @@ class ServedPolicy:
             prove(checkpoint, features, say)
         return cls(checkpoint, policy, features, str(folder), FirstLook(checkpoint), say)
 
-    def session(self, fresh: bool = True, seed: int = 0) -> "Session":
+    def session(
+        self, fresh: bool = True, seed: int = 0, key_map: KeyMap | None = None
+    ) -> "Session":
         """A session of one robot; `seed` seeds the samples that the policy draws for it.
 
         With `fresh` a chunk waits for the features of the frames of its own observation. Without,
-        it takes the newest features, and waits only for the first of an episode.
+        it takes the newest features, and waits only for the first of an episode. `key_map`
+        translates the names of a known robot's client.
         """
-        return Session(self, fresh, seed)
+        return Session(self, fresh, seed, key_map)
 
     def close(self) -> None:
         """Begin no more passes, and wait for the one that runs."""
@@ -185,11 +189,13 @@ class Session:
     One thread at a time may call a session; sessions of one policy may run at once.
     """
 
-    def __init__(self, served: ServedPolicy, fresh: bool, seed: int) -> None:
+    def __init__(
+        self, served: ServedPolicy, fresh: bool, seed: int, key_map: KeyMap | None = None
+    ) -> None:
         self.metadata = served.metadata
         self._served, self._fresh = served, fresh
         self._drawn = torch.Generator().manual_seed(seed)
-        self._reader = ObservationReader(served.metadata)
+        self._reader = ObservationReader(served.metadata, key_map)
         source = served.checkpoint.source
         # Half a tick less, because clocks are not exact.
         self._between_s = (source["vlm_reuse_count"] - 0.5) / source["action_hz"]
@@ -199,8 +205,9 @@ class Session:
         """The answer to an observation: `actions` (horizon, action) in the units of the metadata.
 
         It also has `server_timing` in ms and, where the policy looks at features, `feature_age_s`,
-        `trained_age_s`, the oldest age in training, and `feature_key` (16,). Raises
-        `ObservationError`, `NumericsError` and `VLMError`.
+        `trained_age_s`, the oldest age in training, and `feature_key` (16,). `warnings` lists what
+        cannot be true of the observation, each once an episode. Raises `ObservationError`,
+        `NumericsError` and `VLMError`.
         """
         return self.answer(self.take(observation))
 
@@ -231,10 +238,12 @@ class Session:
             trained_s = self.metadata["trained_age_s"]
             answer |= {"feature_age_s": age_s, "trained_age_s": trained_s, "feature_key": key}
             self._served.warn_of_age(age_s)
+        if doubts := self._doubts.of(observation):
+            answer["warnings"] = doubts
         return answer
 
     def _begin_episode(self) -> None:
-        self._memory = RobotMemory.of(self._served.policy)
+        self._memory, self._doubts = RobotMemory.of(self._served.policy), Doubts()
         # A pass of the episode before has its own deque, and nobody takes its result.
         self._waiting: WaitingFrames = deque(maxlen=1)
         self._running: Future[Pass] | None = None

@@ -6,8 +6,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.base.errors import ObservationError
-from pipeline.robot.observation import ObservationReader
+from pipeline.base.errors import ConfigError, ObservationError
+from pipeline.robot.key_maps import KEY_MAPS
+from pipeline.robot.observation import Doubts, ObservationReader
 from pipeline.simulation.rendering import VIEWS
 
 Observe = Callable[..., dict[str, Any]]
@@ -163,3 +164,64 @@ def test_what_the_policy_lacks_is_refused(observe: Observe) -> None:
     guide = {"guide/chunk": np.zeros((4, 7)), "guide/weight": np.zeros(4)}
     with pytest.raises(ObservationError, match=r"guide/chunk: expected one of .*this policy"):
         lacking.read(observe(0, sensor=None, sensor_time=None) | guide)
+
+
+def test_fields_may_be_nested_and_a_single_reading_has_no_axis(reader: ObservationReader) -> None:
+    flat = reader.read({"images/View1": FRAME, "state": STATE[:1], "time": 1.0})
+    nested = reader.read({"images": {"View1": FRAME}, "state": STATE[0].tolist(), "time": 1.0})
+    np.testing.assert_array_equal(nested.frames["View1"], flat.frames["View1"])
+    np.testing.assert_array_equal(nested.readings["state"], flat.readings["state"])
+    with pytest.raises(ObservationError, match=r"^images/View1: expected it once"):
+        reader.read({"images": {"View1": FRAME}, "images/View1": FRAME})
+
+
+OPENPI: dict[str, dict[str, Any]] = {
+    "droid": {
+        "observation/exterior_image_1_left": np.zeros((4, 6, 3), np.uint8),
+        "observation/wrist_image_left": np.full((4, 6, 3), 7, np.uint8),
+        "observation/joint_position": np.arange(7.0),
+        "observation/gripper_position": np.array([7.0]),
+    },
+    "libero": {
+        "observation/image": np.zeros((4, 6, 3), np.uint8),
+        "observation/wrist_image": np.full((4, 6, 3), 7, np.uint8),
+        "observation/state": np.arange(8.0),
+    },
+}
+"""What openpi's examples of these robots send, beside the prompt."""
+
+
+@pytest.mark.parametrize("robot", OPENPI)
+def test_openpis_names_of_a_robot_are_translated(robot: str) -> None:
+    streams = {"views": ["View1", "View2"], "state": {"names": ["j"] * 8}}
+    given = OPENPI[robot] | {"prompt": "do something"}
+    read = ObservationReader(METADATA | {"streams": streams}, KEY_MAPS[robot]).read(given)
+    assert [frame.max() for frame in read.frames.values()] == [0, 7] and read.prompt
+    assert read.readings["state"].tolist() == [[*range(8)]]
+    with pytest.raises(ObservationError, match=r"set serve\.transform"):
+        ObservationReader(METADATA | {"streams": streams}).read(given)
+
+
+def test_what_does_not_fit_a_known_robot_is_refused() -> None:
+    droid, given = KEY_MAPS["droid"], {"observation/joint_position": np.arange(7.0)}
+    with pytest.raises(ObservationError, match=r"^observation/gripper_position: expected it"):
+        droid.apply(given, ["View1"])
+    given |= {"observation/gripper_position": np.zeros((2, 2))}
+    with pytest.raises(ObservationError, match=r"^observation/joint_position .* of one reading"):
+        droid.apply(given, ["View1"])
+    with pytest.raises(ConfigError, match=r"serve\.transform: expected a policy of at most 2"):
+        droid.refuse_more(["View1", "View2", "View3"])
+
+
+def test_what_cannot_be_true_is_doubted_once(reader: ObservationReader, observe: Observe) -> None:
+    doubts, state = Doubts(), np.zeros((1, 12))
+    black = {"images/View1": np.zeros((4, 6, 3), np.uint8)}
+    kept = {"images/View2": observe(0)["images/View2"]}
+    new = [
+        doubts.of(reader.read(observe(tick, state=state, state_time=None, **black, **kept)))
+        for tick in range(12)
+    ]
+    assert [text.split(":")[0] for text in new[0]] == ["images/View1", "state"]
+    (still, other) = new[9]
+    assert still.startswith("images/View1: 10 frames") and other.startswith("images/View2: 10 f")
+    assert not any(new[1:9]) and not any(new[10:])

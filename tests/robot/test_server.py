@@ -20,7 +20,8 @@ from pipeline.base.config import ServeParams
 from pipeline.base.errors import ConfigError
 from pipeline.robot import wire
 from pipeline.robot.client import PolicyClient
-from pipeline.robot.server import PolicyServer, ServerStatus, listen, read_token
+from pipeline.robot.server import PolicyServer, listen, read_token
+from pipeline.robot.server_status import ServerStatus
 
 Observe = Callable[..., dict[str, Any]]
 Serving = Callable[..., PolicyServer]
@@ -64,7 +65,7 @@ def test_over_the_wire_is_bit_for_bit_what_it_is_in_process(
     served = served_policy("flow_matching")
     here = served.session(seed=3)
     with client_of(serving(served, seed=3)) as client:
-        assert client.metadata == served.metadata
+        assert client.metadata == served.metadata | {"transform": None}
         for tick in range(8):
             there, own = client.infer(observe(tick)), here.infer(observe(tick))
             np.testing.assert_array_equal(there["actions"], own["actions"])
@@ -158,6 +159,64 @@ def test_what_is_wrong_with_a_message_costs_its_connection_only(
             assert closing_code(bare) == code
         assert good.infer(observe(1))["actions"].shape == (4, 7)
     assert server.status.refused == 1
+
+
+def test_each_event_is_a_line_and_refusals_stay_on_the_status_page(
+    served_policy: Served, serving: Serving, observe: Observe
+) -> None:
+    served = served_policy()
+    server = serving(served, log="json")
+    with client_of(server) as client:
+        client.reset()
+        client.infer(observe(0, prompt="go on"))
+        client.infer(observe(1, state=np.zeros((1, 12)), state_time=[0.15]))
+    for _ in range(3):
+        with opened(server) as bare:
+            bare.send(wire.pack({"gripper": 1}))
+            bare.recv(20)
+            assert closing_code(bare) == 1008
+    assert get(server, "/status.json", Origin="http://elsewhere")[0] == 403
+    shown = json.loads(get(server, "/status.json")[1])
+    assert [(r["event"], r["text"].split(":")[0]) for r in shown["refusals"]] == [
+        ("refused", "gripper"), ("turned away", "web pages are not served"),
+    ]  # fmt: skip
+    (warning,) = shown["warnings"]
+    assert warning["text"].startswith("state: every channel is exactly 0")
+    lines = [json.loads(line) for line in served.said if line.startswith("{")]
+    assert [line["event"] for line in lines[:4]] == ["connected", "episode", "warning", "left"]
+    assert lines[1]["text"] == "go on" and lines[3]["text"].startswith("2 answers in ")
+    assert sum(line["event"] == "refused" for line in lines) == 1, "the others are the same"
+
+
+def test_what_repeats_is_counted(served_policy: Served, monkeypatch: pytest.MonkeyPatch) -> None:
+    now_s, lines = [0.0], list[str]()
+    monkeypatch.setattr("pipeline.robot.server_status.monotonic", lambda: now_s[0])
+    status = ServerStatus(served_policy().metadata, lines.append)
+    for second in range(12):
+        now_s[0] = float(second)
+        status.note("slow", f"10.0.0.1:{second}", f"an answer took {second} ms", "")
+        status.note("slow", "10.0.0.2:1", "", "")
+    assert [line.split(" ", 1)[1] for line in lines if "10.0.0.1" in line] == [
+        "10.0.0.1:0 slow: an answer took 0 ms",
+        "10.0.0.1:10 slow: an answer took 10 ms (9 more like it)",
+    ]
+    for reason in range(2000):
+        status.note("refused", "10.0.0.1:1", str(reason))
+    assert len(status._written_s) <= 1000 and len(json.loads(status.json())["refusals"]) == 20
+
+
+def test_a_client_of_a_known_robot_is_answered(
+    served_policy: Served, serving: Serving, observe: Observe
+) -> None:
+    served = served_policy()
+    own = observe(0, state=np.arange(12.0), state_time=None, sensor=None, sensor_time=None)
+    cameras = ("cam_high", "cam_left_wrist", "cam_right_wrist")
+    views = [name for name in own if name.startswith("images/")]
+    images = {c: np.moveaxis(own[v], -1, 0) for c, v in zip(cameras, views, strict=True)}
+    with client_of(serving(served, transform="aloha")) as client:
+        assert client.metadata["transform"] == "aloha"
+        answer = client.infer({"images": images, "state": own["state"], "time": own["time"]})
+    np.testing.assert_array_equal(answer["actions"], served.session().infer(own)["actions"])
 
 
 def test_a_message_beyond_the_bound_is_not_read(

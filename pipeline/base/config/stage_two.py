@@ -351,6 +351,14 @@ class ServeParams(Section):
     """Of one observation, in MiB."""
     idle_s: float = Field(default=600.0, gt=0, le=1e6)
     """A connection without a whole message for so long is closed."""
+    transform: Literal["aloha", "droid", "libero"] | None = None
+    """Take observations by the names that openpi's clients of this robot give. Their images are
+    the policy's views in this order. aloha: `images/cam_high`, `cam_left_wrist`,
+    `cam_right_wrist`, `cam_low`; `state`. droid: `observation/exterior_image_1_left`,
+    `wrist_image_left`; the state is `joint_position` and `gripper_position`. libero:
+    `observation/image`, `wrist_image`; `observation/state`."""
+    log: Literal["text", "json"] = "text"
+    """How the line of each connection, episode, slow answer, warning and refusal is written."""
 
 
 class ExportParams(Section):
