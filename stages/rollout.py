@@ -57,6 +57,7 @@ def _write_nothing(folder: Path) -> None:
     for name in ("settings.json", "episodes.csv", "beside.csv"):
         (folder / name).unlink(missing_ok=True)
     write_document(folder / "metrics.json", {"success": {}})
+    write_document(folder / "headline.json", {})
     write_report(folder, Report("No rollouts", "`rollout.environment` is null.", (), ()))
 
 
@@ -96,19 +97,20 @@ def _served(wanted: "RolloutParams", say: Callable[[str], None]) -> "Rollouts":
 def _write(folder: Path, rollouts: "Rollouts") -> list[Path]:
     """Metrics, the table of episodes and the page; returns their paths."""
     from pipeline.base.files import REPORT, claim, write_document
+    from pipeline.evaluate.rollouts import POLICY
     from pipeline.look.page.writing import write_report
     from pipeline.look.rollout import rollout_report
 
     claim(folder, REPORT)
     write_document(folder / "metrics.json", rollouts.document())
+    write_document(folder / "headline.json", {"success": rollouts.rates()[POLICY].rate})
     write_document(folder / "settings.json", dict(rollouts.settings))
     tables = [
         rollouts.table(policy=True).write_csv(folder / "episodes.csv"),
         rollouts.table(policy=False).write_csv(folder / "beside.csv"),
     ]
     return [
-        folder / "metrics.json",
-        folder / "settings.json",
+        *(folder / f"{name}.json" for name in ("metrics", "headline", "settings")),
         *tables,
         *write_report(folder, rollout_report(rollouts)),
     ]

@@ -1,5 +1,6 @@
 """The figures of an evaluation as printed text, as `metrics.json` and as CSV files."""
 
+from collections.abc import Mapping
 from dataclasses import astuple
 from itertools import chain
 from pathlib import Path
@@ -40,6 +41,8 @@ FOOTNOTE = (
 )
 ABLATION_FOOTNOTE = "zeroed: every value at its training mean, which the policy sees as zeros"
 METRICS = "metrics.json"
+HEADLINE = "headline.json"
+"""The numbers that `dvc metrics` shows."""
 ERRORS = "errors.csv"
 """The file with the errors of all methods over the whole chunk: a line for each action group and
 `OVERALL`."""
@@ -105,6 +108,15 @@ def metrics(comparison: Comparison, energy: Figure | None = None) -> dict[str, A
             for phase, part in phases.items()
         }
     return document
+
+
+def headline(figures: Mapping[str, Any]) -> dict[str, float]:
+    """The content of `headline.json`, of that of `metrics.json`: what decides between policies."""
+    return {
+        f"{scope}_error{suffix}": figures[scope][OVERALL][who]["value"]
+        for scope in ("executed", "chunk")
+        for who, suffix in (("policy", ""), ("best_baseline", "_of_best_baseline"))
+    }
 
 
 def _rivals(rivals: Rivalry) -> dict[str, dict[str, float]]:
@@ -260,7 +272,7 @@ def evaluated_on(study: AblationStudy) -> str:
 
 
 def write_tables(folder: Path, evaluation: Evaluation) -> list[Path]:
-    """Write metrics.json and one CSV each of all errors: see docs/reports.md.
+    """Write metrics.json, its headline and one CSV each of all errors: see docs/reports.md.
 
     Without a `study`, modalities.csv and streams.csv have headings alone: `dvc plots` needs the
     files, and those of an earlier evaluation must not stay.
@@ -278,8 +290,11 @@ def write_tables(folder: Path, evaluation: Evaluation) -> list[Path]:
         "modalities.csv": _ablation_errors(study),
         "streams.csv": _streams(study),
     }
-    write_document(folder / METRICS, metrics(comparison, evaluation.energy))
-    return [folder / METRICS, *(files[name].write_csv(folder / name) for name in files)]
+    figures = metrics(comparison, evaluation.energy)
+    write_document(folder / METRICS, figures)
+    write_document(folder / HEADLINE, headline(figures))
+    tables = [files[name].write_csv(folder / name) for name in files]
+    return [folder / METRICS, folder / HEADLINE, *tables]
 
 
 def _errors(comparison: Comparison, group: ActionGroup | None = None) -> dict[str, Any]:
