@@ -199,7 +199,7 @@ class PolicyServer:
         finally:
             self.status.connected -= 1
             seconds = monotonic() - since_s
-            self.status.note("left", robot, f"{answers} answers in {seconds:.1f} s", robot)
+            self.status.note("left", robot, f"{answers} answers in {seconds:.1f} s")
 
     async def _next(self, connection: ServerConnection) -> str | bytes:
         """The next message; closes a connection that sends none."""
@@ -247,14 +247,14 @@ class PolicyServer:
             waiting = self._params.max_waiting
             return f"busy: {waiting} observations are waiting; the readings were taken"
         if observation.reset:
-            self.status.note("episode", robot, observation.prompt or "", robot)
+            self.status.note("episode", robot, observation.prompt or "")
         answer = session.answer(observation)
         self.status.answered(answer["server_timing"])
         for warning in answer.get("warnings", ()):
             self.status.note("warning", robot, warning)
         if (spent_ms := answer["server_timing"]["infer_ms"]) > self._allowed_ms:
             half = f"half of a chunk is {self._allowed_ms:.0f} ms"
-            self.status.note("slow", robot, f"an answer took {spent_ms:.0f} ms, {half}", "")
+            self.status.note("slow", robot, f"an answer took {spent_ms:.0f} ms, {half}")
         if "feature_key" in answer:
             # Bytes, not an array: openpi's chunk broker takes every array for one of steps.
             answer["feature_key"] = answer["feature_key"].tobytes()

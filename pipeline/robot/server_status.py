@@ -15,6 +15,8 @@ Event = Literal[
     "connected", "left", "episode", "slow", "warning", "busy", "refused", "error", "turned away"
 ]
 REFUSALS: Final = ("busy", "refused", "error", "turned away")
+_EACH: Final = ("connected", "left", "episode")
+"""Events of which each is written."""
 _TIMED: Final = ("vlm_ms", "head_ms", "wait_ms", "infer_ms")
 _TIMINGS: Final = 5000
 """Newest answers whose latencies are kept."""
@@ -55,16 +57,17 @@ class ServerStatus:
         with self._lock:
             self._timings.note([timing[part] or math.nan for part in _TIMED])
 
-    def note(self, event: Event, robot: str, text: str = "", repeats: str | None = None) -> None:
+    def note(self, event: Event, robot: str, text: str = "") -> None:
         """Write the line of an event, unless the same one was written within 10 s.
 
-        `robot` is an address. Events are the same where host, event and `repeats` are, which is
-        `text` where None.
+        `robot` is an address. Events are the same where the host and the text are; slow answers of
+        a host are.
         """
-        key = (event, robot.rpartition(":")[0], text if repeats is None else repeats)
+        key = (event, robot.rpartition(":")[0], "" if event == "slow" else text)
         with self._lock:
             now_s = monotonic()
-            if now_s - self._written_s.get(key, -math.inf) < _QUIET_S:
+            repeats = now_s - self._written_s.get(key, -math.inf) < _QUIET_S
+            if repeats and event not in _EACH:
                 self._skipped[key] = self._skipped.get(key, 0) + 1
                 return
             if len(self._written_s) >= _REMEMBERED:  # strangers may make up reasons

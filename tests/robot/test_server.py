@@ -194,12 +194,14 @@ def test_what_repeats_is_counted(served_policy: Served, monkeypatch: pytest.Monk
     status = ServerStatus(served_policy().metadata, lines.append)
     for second in range(12):
         now_s[0] = float(second)
-        status.note("slow", f"10.0.0.1:{second}", f"an answer took {second} ms", "")
-        status.note("slow", "10.0.0.2:1", "", "")
+        status.note("slow", f"10.0.0.1:{second}", f"an answer took {second} ms")
+        status.note("slow", "10.0.0.2:1")
+        status.note("episode", "10.0.0.3:1", "go")
     assert [line.split(" ", 1)[1] for line in lines if "10.0.0.1" in line] == [
         "10.0.0.1:0 slow: an answer took 0 ms",
         "10.0.0.1:10 slow: an answer took 10 ms (9 more like it)",
     ]
+    assert sum("10.0.0.3:1 episode: go" in line for line in lines) == 12
     for reason in range(2000):
         status.note("refused", "10.0.0.1:1", str(reason))
     assert len(status._written_s) <= 1000 and len(json.loads(status.json())["refusals"]) == 20
