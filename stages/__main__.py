@@ -4,7 +4,7 @@
   vla-cache NAME --keys                    the keys of params.yaml that it reads
   source <(vla-cache --completion bash)    completion, for zsh and tcsh too
 
-Each is also python -m stages.NAME. Without any, dvc repro runs the pipeline as params.yaml stands.
+Each command is also python -m stages.NAME. dvc repro runs the whole pipeline with params.yaml.
 """
 
 import argparse
@@ -29,7 +29,7 @@ COMMANDS = {
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command that is named; returns its exit code."""
+    """Run the named command; returns its exit code."""
     given = list(sys.argv[1:] if arguments is None else arguments)
     if given and given[0] in _names():
         stage: Any = import_module(f"stages.{given[0]}")

@@ -1,8 +1,8 @@
-"""Make a small copy of a store for keeping and sharing, or the store from such a copy.
+"""Make a small copy of a store to keep or to share, or restore the store from such a copy.
 
-The archive is a plain zarr v3 group with the same arrays under the same names: compressed, in few,
-large files, every piece of them checksummed. --restore gives back the store, equal in every byte;
-what is damaged in an archive is named and never restored.
+The archive is a plain zarr v3 group with the same arrays under the same names. It is compressed, in
+a few large files, and every piece of them has a checksum. --restore gives back the store, equal in
+every byte. If an archive is damaged, the damage is named and nothing damaged is restored.
 
   python -m stages.archive                       extract.store -> <its name>.archive.zarr beside it
   python -m stages.archive --restore             the store from that archive
@@ -58,7 +58,7 @@ def _table(manifest: "Manifest") -> "Table":
         for name, array in manifest.arrays.items()
     ]
     rows = [
-        (name, raw / 1e6, raw / stored if stored else None, codec)  # zeros take no shard
+        (name, raw / 1e6, raw / stored if stored else None, codec)  # zeros have no shard
         for name, raw, stored, codec in sizes
     ]
     return Table(("array", "MB", "ratio", "codec"), rows)

@@ -30,19 +30,19 @@ class Shorthand:
     """section.key of params.yaml."""
     help: str
     value: str | None = None
-    """What the value is called in the help; None for an option that takes none and means true."""
+    """The name of the value in the help; None for an option without a value, which means true."""
     nargs: str | None = None
-    """As argparse has it; `"*"` makes a list, `"?"` an option whose value may be left out: true."""
+    """As in argparse: `"*"` takes a list; with `"?"` the value may be left out and is then true."""
 
     def add_to(self, parser: argparse.ArgumentParser) -> None:
-        """Declare it."""
-        said = f"{self.help} (--set {self.key}=…)"
+        """Add it to the parser."""
+        text = f"{self.help} (--set {self.key}=…)"
         if self.value is None:
-            parser.add_argument(self.name, action="store_const", const=True, help=said)
+            parser.add_argument(self.name, action="store_const", const=True, help=text)
         else:
             left_out: dict[str, Any] = {"const": True} if self.nargs == "?" else {}
             parser.add_argument(
-                self.name, metavar=self.value, nargs=self.nargs, help=said, **left_out
+                self.name, metavar=self.value, nargs=self.nargs, help=text, **left_out
             )
 
     def override(self, options: argparse.Namespace) -> list[str]:
@@ -50,7 +50,7 @@ class Shorthand:
         given: Any = getattr(options, self.name.lstrip("-"))
         if given is None or given == []:
             return []
-        # A word stays as it was typed, so that 8 is a number; else no character means anything.
+        # A plain word stays as typed, so that 8 is a number; YAML must not interpret other text.
         word = isinstance(given, str) and re.fullmatch(r"[\w.+-]+", given)
         return [f"{self.key}={given if word else json.dumps(given)}"]
 
@@ -65,10 +65,10 @@ def run(
 ) -> int:
     """Parse the options, do the work, return the exit code.
 
-    0 done; 2 something the user can mend, said in one message without a traceback; 1 stopped by
-    Ctrl-C or SIGTERM, by a reader of the output that has gone (`| head`), or by a bug, which keeps
-    its traceback. `--help` imports nothing; `work` imports what takes seconds itself. `sections`
-    are those of params.yaml that `--keys` lists.
+    The code is 0 when the work is done, and 2 for what the user can mend, with one message and no
+    traceback. It is 1 after Ctrl-C or SIGTERM, if the reader of the output has gone (`| head`), or
+    after a bug, which keeps its traceback. `--help` imports nothing; `work` itself imports what
+    takes seconds. `sections` are the sections of params.yaml that `--keys` lists.
     """
     signalled: list[int] = []
     with _stopped_by_signals(signalled):
@@ -89,7 +89,7 @@ def _run(
     shorthands: Sequence[Shorthand],
     sections: Sequence[str],
 ) -> int:
-    """`run` with its options parsed."""
+    """Do what `run` does after it has parsed the options."""
     from pipeline.base.commands import running_with
     from pipeline.base.config import Params, described_keys, load_params
     from pipeline.base.errors import PipelineError
@@ -98,34 +98,34 @@ def _run(
         if options.keys:
             print("\n".join(described_keys(sections or tuple(Params.model_fields))))
         else:
-            given = (one for each in shorthands for one in each.override(options))
+            given = (pair for shorthand in shorthands for pair in shorthand.override(options))
             params = load_params(options.params, [*options.overrides, *given])
             with running_with(options.params, options.overrides):
                 work(params)
-        sys.stdout.flush()  # not at the interpreter's exit, where an error is said in any case
+        sys.stdout.flush()  # here, where an error is handled: at the interpreter's exit it is not
     except PipelineError as error:
         return _refuse(str(error))
     except OSError as error:
         if isinstance(error, BrokenPipeError) and _is_unread():
-            # What stdout still holds must not fail again when the interpreter exits.
+            # The text that stdout still holds must not fail again when the interpreter exits.
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-            return 0 if options.keys else 1  # who reads keys has read enough
+            return 0 if options.keys else 1  # a reader of the keys has read enough
         place = f"{error.filename}: " if error.filename else ""
-        said = f"{place}{error.strerror or error}. Look at that path, then run the same again."
-        return _refuse(said)
+        message = f"{place}{error.strerror or error}. Look at that path, then run the same again."
+        return _refuse(message)
     return 0
 
 
 @contextmanager
 def _stopped_by_signals(signalled: list[int]) -> Generator[None]:
-    """Ctrl-C and SIGTERM stop through every `finally`, and are noted.
+    """Within it, Ctrl-C and SIGTERM stop the work through every `finally`, and are noted.
 
     A signal that a shell or nohup has set to be ignored stays ignored.
     """
 
     def stop(signum: int, frame: FrameType | None) -> None:
         signalled.append(signum)
-        signal.signal(signal.SIGTERM, signal.SIG_IGN)  # no second one may cut a `finally`
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)  # a second one must not cut a `finally`
         raise KeyboardInterrupt
 
     before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
@@ -168,13 +168,13 @@ def parser_of(
     return parser
 
 
-def _refuse(said: str) -> int:
-    print(f"error: {said}", file=sys.stderr)
+def _refuse(message: str) -> int:
+    print(f"error: {message}", file=sys.stderr)
     return 2
 
 
 def _is_unread() -> bool:
-    """Whether what reads stdout or stderr has gone; other pipes break for reasons of their own."""
+    """Whether the reader of stdout or stderr has gone; other pipes break for other reasons."""
     poll = select.poll()
     for stream in (sys.stdout, sys.stderr):
         poll.register(stream, 0)

@@ -1,13 +1,14 @@
-"""Put the evaluations of several experiments side by side, beside the baselines of all of them.
+"""Compare the evaluations of several experiments with one another and with the baselines.
 
-What is executed first, then the whole chunk, with 95 % intervals: each experiment beside the best
-of them and beside the best baseline, and whether the difference is resolved. Policies whose
-trainings differ by train_head.seed alone are one row, with the spread over the seeds; so are those
-that differ by train_head.split.fold alone, with the test groups of all folds.
+Prints two tables with 95 % intervals: for the executed steps, then for the whole chunk. They
+compare each experiment with the best one and with the best baseline, and say whether the difference
+is resolved. Policies whose trainings differ only in train_head.seed are one row, with the spread
+over the seeds; so are those that differ only in train_head.split.fold, with the test groups of all
+folds.
 
-Takes every folder of `compare.reports` that stages.evaluate wrote, and passes over what else lies
-there, such as the logs of a training. Writes report.html, experiments.csv and experiments.png into
-`compare.output`; the tables as Markdown beside that folder.
+Reads every folder in `compare.reports` that stages.evaluate wrote, and skips everything else there,
+such as the logs of a training. Writes report.html, experiments.csv and experiments.png into
+`compare.output`, and the tables as Markdown beside that folder.
 
   python -m stages.compare                                   of bash experiments/experts.sh
   python -m stages.compare --set compare.reports=reports     reports/evaluate, reports/blind, …

@@ -1,9 +1,8 @@
 """Write the demo: simulated needle insertions in every format, and a small Qwen2.5-VL.
 
 Writes demo.episodes episodes in each of four formats to demo.recordings, about 60 MB, and a model
-of random weights to demo.checkpoint. The same seed gives the same bytes.
-Finished sets are kept, an interrupted run goes on with the others, and a folder that the demo did
-not write is refused.
+with random weights to demo.checkpoint. The same seed gives the same bytes. Finished sets are kept,
+an interrupted run continues with the others, and a folder that the demo did not write is refused.
 
   python -m stages.demo                            as params.yaml stands
   python -m stages.demo --set demo.episodes=3      a quick look
@@ -23,7 +22,7 @@ SECTIONS = ("demo",)
 
 
 def main(params: "Params") -> None:
-    """The recordings under `demo.recordings`, the checkpoint at `demo.checkpoint`."""
+    """Write the recordings under `demo.recordings` and the checkpoint at `demo.checkpoint`."""
     from pipeline.base.files import recover_folder, replace_folder, write_document
     from pipeline.simulation.demo_recordings import (
         DEMO,

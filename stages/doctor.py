@@ -1,18 +1,18 @@
-"""Look at this machine: what is there, what is missing, and what to install or set.
+"""Check this machine: what is there, what is missing, and what to install or set.
 
 Checks Python and packages, the GPU, torch's build and the attention backend, the checkpoint, the
-recordings and their videos, for the params given. Downloads nothing, loads no model, changes
-nothing; takes some seconds. The room that the store needs: python -m stages.extract --set
-extract.plan=true. What DVC has and how it links: dvc doctor.
+recordings and their videos, for the given params. It downloads nothing, loads no model and changes
+nothing; it takes some seconds. For the room that the store needs, run python -m stages.extract
+--set extract.plan=true; for what DVC has and how it links, run dvc doctor.
 
   python -m stages.doctor                                        as params.yaml stands
   python -m stages.doctor --set vlm.checkpoint=Qwen/Qwen2.5-VL-3B-Instruct --set data.root=/lab
 
   ok        as it should be
   note      works, but could be better, or is needed later
-  missing   the default pipeline does not run with these params; -> says what mends it
+  missing   the default pipeline does not run with these params; the text after -> says what to do
 
-Exit code 2 where something is missing. Next: python -m stages.extract --set extract.plan=true
+The exit code is 2 if something is missing. Next: python -m stages.extract --set extract.plan=true
 """
 
 from typing import TYPE_CHECKING
@@ -27,7 +27,7 @@ SECTIONS = ("data", "vlm", "extract", "train_head")
 
 
 def main(params: "Params") -> None:
-    """Print every group of issues; refuse where something is missing."""
+    """Print every group of issues; raise `PipelineError` if something is missing."""
     from pipeline.base.commands import command
     from pipeline.base.errors import PipelineError
     from pipeline.look.doctor import describe, examine

@@ -1,10 +1,10 @@
-"""Evaluate a trained policy on its test episodes, beside what simple rules would do.
+"""Evaluate a trained policy on its test episodes, and compare it with simple rules.
 
-Takes what stages.train_head wrote to train_head.output, or evaluate.checkpoint if it is given.
-Writes metrics.json, tables (CSV) and a page with its pictures (report.html, PNG) into
-`evaluate.output`, and judged.json, which says what was evaluated on what. With
-`evaluate.modalities`, evaluates again with each stream ablated. The page shows the frames of the
-best and the worst episode where their recordings still lie below `data.root`.
+Reads what stages.train_head wrote to train_head.output, or evaluate.checkpoint if it is set. Writes
+metrics.json, tables (CSV) and a page with its pictures (report.html, PNG) into `evaluate.output`,
+and judged.json, which says what was evaluated on what. With `evaluate.modalities` it evaluates
+again with each stream ablated. The page shows frames of the best and the worst episode if their
+recordings are still below `data.root`.
 """
 
 import os
@@ -49,7 +49,7 @@ def main(params: "Params") -> None:
 
 
 def _store_for(checkpoint: "PolicyCheckpoint", params: "Params") -> "FeatureStore":
-    """The store that is named, or else trained from, which this policy fits."""
+    """The store that is named, else the one trained from, after a check that the policy fits it."""
     from pipeline.store import FeatureStore, check_trailers
     from pipeline.train.training_data import check_store
 
@@ -62,9 +62,9 @@ def _store_for(checkpoint: "PolicyCheckpoint", params: "Params") -> "FeatureStor
 
 
 def _rollouts_page(params: "Params") -> str:
-    """Where stages.rollout puts the page of this policy, seen from here; empty where it does not.
+    """The path from this page to that of stages.rollout; empty unless it shows the same policy.
 
-    By the params alone: dvc repro runs it after this stage.
+    It follows from the params alone, because dvc repro runs stages.rollout after this stage.
     """
     from pipeline.look.page.writing import PAGE
 
@@ -77,7 +77,7 @@ def _rollouts_page(params: "Params") -> str:
 
 
 def _write(folder: Path, evaluation: "Evaluation", rollouts: str) -> list[Path]:
-    """The tables, the page with its pictures, and what was evaluated; returns their paths."""
+    """Write the tables, the page with its pictures and judged.json; returns their paths."""
     from pipeline.base.files import REPORT, claim, write_document
     from pipeline.evaluate.evaluation import JUDGED
     from pipeline.evaluate.tables import write_tables

@@ -1,9 +1,10 @@
 """Write the head of a trained policy, all but the vision-language model, for other runtimes.
 
-Takes what stages.train_head wrote to train_head.output, or export.checkpoint if it is given. Writes
-head.onnx (ONNX Runtime) and head.pt2 (torch.export.load) into `export.output`, which need none of
-this project, and receipt.json: inputs and outputs with their units, digests, and how far each file
-is from the policy. A file that is too far is refused, and what was there before stays.
+Reads what stages.train_head wrote to train_head.output, or export.checkpoint if it is set. Writes
+head.onnx (ONNX Runtime) and head.pt2 (torch.export.load) into `export.output`; both run without
+this project. Also writes receipt.json: inputs and outputs with their units, digests, and how far
+the answers of each file are from the policy's. If they are too far, the export is refused and the
+earlier files stay.
 
   python -m stages.export
   python -m stages.export --set export.formats=[torch]         without ONNX's packages

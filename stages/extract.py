@@ -1,8 +1,8 @@
-"""Run the frozen vision-language model over recordings once and keep what it says in a store.
+"""Run the frozen vision-language model over recordings once and keep its features in a store.
 
 Reads recordings (camera frames, force, A-scan, robot state, actions) and a Qwen2.5-VL checkpoint.
-Writes one zarr store that training then needs alone: pooled features of the model for every
-vlm_reuse_count-th control tick, and the raw streams. As params.yaml stands, that is the demo.
+Writes one zarr store, which is all that training needs: pooled features of the model for every
+vlm_reuse_count-th control tick, and the raw streams. The given params.yaml extracts the demo.
 
   python -m stages.doctor                              is this machine ready, does the store fit
   python -m stages.extract --set extract.plan=true     how many rows, how large, how long, and why
@@ -16,9 +16,10 @@ For your own recordings set these in params.yaml, or with --set:
                     vlm.dtype: bfloat16, vlm.image_resize_height: 360, vlm.image_resize_width: 640
   extract.store     cache_store/lab.zarr
 
-All episodes are read and checked first; whatever is wrong is listed before anything is computed.
-Stop it whenever you like: the same command goes on. A finished store is left alone when nothing
-changed; added recordings compute only their rows; extract.batch_size and workers change no feature.
+All episodes are read and checked first, and all errors are listed before anything is computed. You
+can stop at any time: the same command continues. If nothing changed, a finished store stays as it
+is; if recordings were added, only their rows are computed. extract.batch_size and workers change no
+feature.
 
 Next: python -m stages.inspect STORE (look at it), stages.train_head (train). docs/ says the rest.
 """

@@ -1,20 +1,20 @@
 """Tune the vision-language model end to end from recordings, with the policy of train_head on top.
 
 Ticks, streams, split and normalisation come from the store that extract wrote, frames from the
-recordings of data.sources. Writes checkpoints with an adapter (or a whole checkpoint) to
-finetune.output, for extract to compute better features with, and curves to finetune.logs; while it
-runs, `dvc plots show <finetune.logs>/plots/metrics` draws them (train_head.loggers adds
+recordings of data.sources. Writes checkpoints with an adapter (or a whole model) to
+finetune.output, so that extract can compute better features with it, and curves to finetune.logs.
+While it runs, `dvc plots show <finetune.logs>/plots/metrics` draws them (train_head.loggers adds
 TensorBoard and Weights & Biases).
 
   python -m stages.finetune                                        low-rank adapters
   python -m stages.finetune --set finetune.tuning.method=full      every weight
   torchrun --nproc_per_node 2 -m stages.finetune                   on two GPUs
 
-Where a GPU's memory does not do: finetune.grad_accumulation, a smaller finetune.batch_size, or
+If a GPU has too little memory, raise finetune.grad_accumulation, lower finetune.batch_size, or set
 finetune.tuning.gradient_checkpointing=true.
 
-Works in `<finetune.output>.part` and renames it when finished; stopped or killed, the same command
-goes on from the last checkpoint. At its end it prints what to run next.
+Works in `<finetune.output>.part` and renames it when finished. After a stop or a kill, the same
+command continues from the last checkpoint. At its end it prints what to run next.
 """
 
 from typing import TYPE_CHECKING

@@ -1,9 +1,9 @@
 """Look at recordings or at a store: one page, and its pictures as PNG files.
 
-The page (report.html) needs nothing beside itself: open it from any folder, send it to anyone. It
-shows what is there, when each stream was sampled, what the model and the policy get of it, and what
-looks wrong. Every recording is checked, some are shown in detail. The exit code is 0 once the page
-is written, whatever it finds, and 2 where nothing could be looked at.
+The page (report.html) needs no other file: open it from any folder, send it to anyone. It shows
+what is there, when each stream was sampled, what the model and the policy receive, and what looks
+wrong. Every recording is checked, some are shown in detail. The exit code is 0 if the page was
+written, whatever was found, and 2 if there was nothing to look at.
 
   python -m stages.inspect                         the recordings of data.sources
   python -m stages.inspect PATH …                  recordings, folders or globs of them
@@ -33,7 +33,7 @@ SHORTHANDS = (
     ),
 )
 SHOWN = 8
-"""Findings that the terminal shows."""
+"""The most findings that the terminal shows."""
 
 
 def main(params: "Params") -> None:
@@ -56,7 +56,7 @@ def main(params: "Params") -> None:
 
 
 def summary(report: "Report") -> Iterator[str]:
-    """What the page says first, for a terminal."""
+    """The beginning of the page, for a terminal."""
     from pipeline.look.page.blocks import Issues
     from pipeline.look.page.issues import FINDINGS, group_issues, place_of, places_of
 

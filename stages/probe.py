@@ -1,17 +1,17 @@
 """Rank the slots of a store by how well a ridge regression reads the action chunk from them.
 
-Reads probe.store (extract.store where null), its checksums first (probe.check_store). Each
-slot by itself and each choice of layer, norm and pooling as a whole, alone and beside past actions,
-state and sensor, cross-validated by recording. Prints the ranking with 95 % intervals and the line
-for params.yaml that the evidence supports; writes metrics.json, slots.csv, groups.csv, targets.csv
-and a picture (PNG) into probe.output.
+Reads probe.store (extract.store if null), and its checksums first (probe.check_store). It scores
+each slot, and each choice of layer, norm and pooling as a whole: alone, and together with past
+actions, state and sensor, cross-validated by recording. Prints the ranking with 95 % intervals and
+the line for params.yaml that the results support. Writes metrics.json, slots.csv, groups.csv,
+targets.csv and a picture (PNG) into probe.output.
 
   python -m stages.probe                             as params.yaml stands
   python -m stages.probe --set probe.max_ticks=2000  that many ticks, evenly spread: a first look
 
-With --set, too: probe.output (where the files go), probe.folds (groups of recordings, each
-predicted from the others), probe.repeats (how often these are dealt), probe.horizon (ticks of the
-action chunk that is predicted).
+You can also --set probe.output (where the files go), probe.folds (groups of recordings, each
+predicted from the others), probe.repeats (how often these are dealt) and probe.horizon (ticks of
+the predicted action chunk).
 
 Next: set vlm.pooling to that line, then python -m stages.extract
 """

@@ -1,10 +1,11 @@
 """Run a trained policy closed loop in the simulated needle insertion, and count its successes.
 
-Takes what stages.train_head wrote to train_head.output, or rollout.checkpoint if it is given, and
-the model of vlm.checkpoint, which must give the features that the policy was trained on. Beside the
-policy: the demonstrator, and the policy without sensor and without features (or what else
-rollout.ablations says). Writes metrics.json (success with its 95 % interval), episodes.csv,
-beside.csv (those of the others), settings.json and a page (report.html) into `rollout.output`.
+Reads what stages.train_head wrote to train_head.output, or rollout.checkpoint if it is set, and the
+model of vlm.checkpoint, which must give the features that the policy was trained on. For comparison
+it also runs the demonstrator, and the policy without sensor and without features (or what
+rollout.ablations says). Writes metrics.json (success with its 95 % interval), episodes.csv (the
+policy's episodes), beside.csv (the others), settings.json and a page (report.html) into
+`rollout.output`.
 
   python -m stages.rollout                                     50 episodes at level full
   python -m stages.rollout --set rollout.level=moved           the target is pushed meanwhile
@@ -48,7 +49,7 @@ def main(params: "Params") -> None:
 
 
 def _write_nothing(folder: Path) -> None:
-    """A page that says so, in place of what earlier rollouts left."""
+    """Write a page that says that there are no rollouts, in place of earlier results."""
     from pipeline.base.files import REPORT, claim, write_document
     from pipeline.look.page.blocks import Report
     from pipeline.look.page.writing import write_report
@@ -62,7 +63,7 @@ def _write_nothing(folder: Path) -> None:
 
 
 def _here(params: "Params", say: Callable[[str], None]) -> "Rollouts":
-    """Those of a checkpoint, with the model in this process."""
+    """The rollouts of a checkpoint, with the model in this process."""
     from pipeline.base.device import resolve_device
     from pipeline.evaluate.rollout_driver import roll_out
     from pipeline.policy.checkpoint import find_policy, load_policy
@@ -83,19 +84,20 @@ def _here(params: "Params", say: Callable[[str], None]) -> "Rollouts":
 
 
 def _served(wanted: "RolloutParams", say: Callable[[str], None]) -> "Rollouts":
-    """Those of the policy that `rollout.server` serves."""
+    """The rollouts of the policy that `rollout.server` serves."""
     from pipeline.evaluate.rollout_driver import roll_out_served
     from pipeline.robot.client import TOKEN_VARIABLE, PolicyClient
 
     assert wanted.server is not None
     with PolicyClient(wanted.server, token=os.environ.get(TOKEN_VARIABLE)) as server:
-        told = server.metadata
-        say(f"{wanted.server}: {told['checkpoint']} (step {told['step']}), level {wanted.level}")
+        policy = server.metadata
+        name, step = policy["checkpoint"], policy["step"]
+        say(f"{wanted.server}: {name} (step {step}), level {wanted.level}")
         return roll_out_served(server, wanted, say)
 
 
 def _write(folder: Path, rollouts: "Rollouts") -> list[Path]:
-    """Metrics, the table of episodes and the page; returns their paths."""
+    """Write metrics, tables of episodes and the page; returns their paths."""
     from pipeline.base.files import REPORT, claim, write_document
     from pipeline.evaluate.rollouts import POLICY
     from pipeline.look.page.writing import write_report

@@ -1,11 +1,11 @@
-"""Serve a trained policy to robots over a websocket, as openpi's clients speak it.
+"""Serve a trained policy to robots over a websocket, with the protocol of openpi's clients.
 
-Takes what stages.train_head wrote to train_head.output, or serve.checkpoint if it is given, and
-the model of vlm.checkpoint, which must give the features that the policy was trained on: that is
-proved before the first connection is taken. Listens on this machine alone unless serve.host says
-otherwise, which needs a token (serve.token_file or VLA_SERVE_TOKEN). /status.json at the same
-address has counts, latencies and connections; /healthz says OK. Ctrl-C answers the observations
-that have come, and stops.
+Reads what stages.train_head wrote to train_head.output, or serve.checkpoint if it is set, and the
+model of vlm.checkpoint. Before the first connection it proves that this model gives the features
+that the policy was trained on. It can be reached from this machine only, unless serve.host says
+otherwise; then it needs a token (serve.token_file or VLA_SERVE_TOKEN). /status.json at the same
+address has counts, latencies and connections; /healthz says OK. After Ctrl-C it answers the
+observations it has received, and stops.
 
   python -m stages.serve                                    at ws://127.0.0.1:8000
   python -m stages.serve --set serve.port=0                 at a free port, which is printed
@@ -43,9 +43,10 @@ def main(params: "Params") -> None:
                 f"{folder} (step {about['step']}): {about['model_type']}, chunks of "
                 f"{about['horizon']} actions at {about['action_hz']:g} Hz"
             )
-            asked = "robots send the token" if token else "no token is asked for"
-            said = f"serving ws://{server.address} ({asked}); status: http://{server.address}/status.json"
-            stopped = server.run(partial(say, said))
+            access = "robots send the token" if token else "no token is asked for"
+            status = f"http://{server.address}/status.json"
+            started = f"serving ws://{server.address} ({access}); status: {status}"
+            stopped = server.run(partial(say, started))
     if stopped:
         raise KeyboardInterrupt
 

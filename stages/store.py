@@ -1,4 +1,4 @@
-"""Housekeeping among the stores of `stores.folder`: what is there, merge, tidy up.
+"""List, merge or tidy up the stores of `stores.folder`.
 
   python -m stages.store list                           sizes, specs, who depends on what
   python -m stages.store merge A.zarr B.zarr --into C.zarr

@@ -1,8 +1,8 @@
 """Train a policy head from the store alone: no image, no vision-language model.
 
-Reads train_head.store (extract.store where null). Writes the best and the last checkpoint to
+Reads train_head.store (extract.store if null). Writes the best and the last checkpoint to
 train_head.output and curves to train_head.logs; while it runs, `dvc plots show` draws them.
-train_head.split says which groups of episodes choose the checkpoint (val) and which are left for
+train_head.split says which groups of episodes choose the checkpoint (val) and which are kept for
 stages.evaluate (test).
 
   python -m stages.train_head                                      what params.yaml says
@@ -10,12 +10,13 @@ stages.evaluate (test).
   python -m stages.train_head --set 'train_head.loggers=[tensorboard]'        or wandb, or both
   torchrun --nproc_per_node 2 -m stages.train_head                 on two GPUs: the same curve
 
-What is set first: train_head.max_steps, batch_size, lr, horizon (ticks an action chunk),
+Set these first: train_head.max_steps, batch_size, lr, horizon (ticks of an action chunk),
 fusion_strategy, mixture (weights of sources), device. train_head.feed says where batches are
-gathered; no number depends on it.
+gathered; it changes no result.
 
-Works in `<output>.part` and renames it when finished. Stopped or killed, the same command goes on
-from the last checkpoint; finished, it does nothing; with other params it begins another run.
+Works in `<output>.part` and renames it when finished. After a stop or a kill, the same command
+continues from the last checkpoint. If the run is finished, it does nothing; with other params it
+begins another run.
 
 Next: python -m stages.evaluate
 """
@@ -42,7 +43,7 @@ def main(params: "Params") -> None:
 
 
 def _train(params: "Params") -> None:
-    # With torch, which takes over a second to import.
+    # These import torch, which takes over a second.
     from pipeline.store import FeatureStore, check_trailers
     from pipeline.train.log import check_loggers
     from pipeline.train.loop import Trainer

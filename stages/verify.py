@@ -1,7 +1,7 @@
 """Check a finished store: structure, files, the checksum of every row, NaN in features.
 
-Reads every byte of verify.store (extract.store where null) and says what is wrong and where. Exit 0
-where the store is sound; 2 with everything that is wrong and what to run next.
+Reads every byte of verify.store (extract.store if null) and says what is wrong and where. The exit
+code is 0 if the store is sound, else 2; then it lists all errors and what to run next.
 
   python -m stages.verify                   check
   python -m stages.verify --reextract 100   also compute 100 random rows again and compare them
@@ -11,7 +11,7 @@ where the store is sound; 2 with everything that is wrong and what to run next.
                                             that the head of train_head.output was trained on
   python -m stages.verify --checkpoint DIR  of another head
 
-The store itself is never written to.
+It never writes to the store itself.
 """
 
 from functools import partial
@@ -37,7 +37,7 @@ SHORTHANDS = (
 
 
 def main(params: "Params") -> None:
-    """Check, and repair or compute rows again where asked to; raises where something is wrong."""
+    """Check the store, and repair it or compute rows again if requested; raises on errors."""
     from pipeline.base.errors import NumericsError, StoreIncomplete
     from pipeline.extract.reextract import reextract
     from pipeline.extract.repair import repair
@@ -67,7 +67,7 @@ def main(params: "Params") -> None:
 
 
 def _prove(params: "Params") -> None:
-    """Compute the golden rows of the checkpoint again, where and as `stages.serve` does."""
+    """Compute the checkpoint's golden rows again, on the same device as `stages.serve`."""
     from pipeline.base.device import resolve_device
     from pipeline.policy.checkpoint import find_policy, load_policy
     from pipeline.robot.live_features import LiveFeatures, prove

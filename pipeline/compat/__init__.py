@@ -1,1 +1,1 @@
-"""The names that the research code had: thin doors, no second implementation."""
+"""The names that the research code had: thin wrappers, no second implementation."""

@@ -35,7 +35,7 @@ class UnifiedBatch(Batch):
     """Equal for ticks that see the same frames."""
     instruction: list[str]
     images: list[Frames] | None = None
-    """Frames of each sample, without views that its episode lacks; one VL row shares arrays."""
+    """Frames of each sample, without views that its episode lacks; equal VL rows share arrays."""
     key: UInt8[Tensor, "batch 16"] | None = None
     """Digest of the features' spec, prompt and frames."""
 
@@ -64,8 +64,8 @@ class UnifiedBatch(Batch):
 def unified_collate_fn(samples: Sequence[Sample] | UnifiedBatch) -> UnifiedBatch:
     """The batch of these samples of one data set; a batch stays as it is.
 
-    Windows have one length already: `*_valid` says how much of each is real. Raises `StoreMismatch`
-    where some samples have features and others have frames.
+    Windows already have one length: `*_valid` says how much of each is real. Raises `StoreMismatch`
+    if some samples have features and others have frames.
     """
     if isinstance(samples, UnifiedBatch):
         return samples

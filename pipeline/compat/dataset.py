@@ -37,19 +37,19 @@ Place = str | Path | Source
 
 
 class UnifiedVLADataset(Dataset[Sample]):
-    """One item a tick: the windows that end there, the chunk that begins there, frames or features.
+    """An item for each tick: the windows that end there, the chunk from there, frames or features.
 
-    Without `store` the streams of all recordings are read into memory (2.7 MB a second of a
-    1,026-channel sensor at 650 Hz), and frames are decoded when an item is read. With `store`
-    items have its features, of the plain frames only, and no stream or frame of a recording is
-    read; `data` then selects recordings, None all. Ticks and windows are those of training either
-    way: see `build_timeline` and `FeatureStore.gather`.
+    Without `store` the streams of all recordings are read into memory (2.7 MB for each second of a
+    1,026-channel sensor at 650 Hz), and frames are decoded when an item is read. With `store` items
+    have its features, of the plain frames only, and no stream or frame of a recording is read;
+    `data` then selects recordings (None: all). Ticks and windows are the same as in training in
+    both cases: see `build_timeline` and `FeatureStore.gather`.
 
-    `horizon` is in ticks, the windows in readings, none of them older than `sensor_window_s` and
-    `state_window_s` (None: of any age). An `action_hz` of None takes recorded rows as ticks, or
-    the ticks of the store. Open `recordings` may replace `data`. `instruction` replaces the
-    instructions of `data`. All recordings have one kind of `action_rotation`; `auto` is rotvec
-    where every recording has poses.
+    `horizon` is in ticks, the windows are in readings, none of them older than `sensor_window_s`
+    and `state_window_s` (None: any age). With `action_hz` None, the ticks are the recorded rows or
+    those of the store. Open `recordings` may replace `data`. `instruction` replaces the
+    instructions of `data`. All recordings have one kind of `action_rotation`; `auto` is rotvec if
+    every recording has poses.
 
     Works in DataLoader workers however they are started: unpickling opens the data again. Use
     `unified_collate_fn`. Raises `RecordingError` for recordings that are missing or broken,
@@ -140,8 +140,8 @@ class UnifiedVLADataset(Dataset[Sample]):
         """Items to train on and items held out: whole groups of episodes, by `split_by_episode`.
 
         With a store these are train and val of `stages.train_head` under `train_head.split` {val:
-        `val_fraction`, test: 0}, and with frames too where sources and episodes have the store's
-        names: the side follows from the hash of "source/id". Use `unified_collate_fn`.
+        `val_fraction`, test: 0}. With frames they are the same if sources and episodes have the
+        store's names: the side follows from the hash of "source/id". Use `unified_collate_fn`.
         """
         keys = None if self._frames is None else first_keys(self._frames)
         params = SplitParams(val=val_fraction, test=0)

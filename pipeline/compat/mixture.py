@@ -19,13 +19,13 @@ from pipeline.train.sampling import TickSampler
 class MixtureBatches(Sampler[list[int]]):
     """The batch sampler of a DataLoader: a batch is a function of (seed, step).
 
-    Each source's share of the draws is its weight (1 where not named), whatever its size, exact to
-    one draw. An epoch has as many draws as there are items. An iteration goes from `first_step` to
-    the end of its epoch; its first batch moves `first_step` to the next epoch, so that an iteration
-    that is broken off is not repeated. To resume a run, set `first_step` to the number of batches
-    that it has taken.
+    Each source's share of the draws is its weight (1 unless named), whatever its size, exact to one
+    draw. An epoch has as many draws as there are items. An iteration goes from `first_step` to the
+    end of its epoch; its first batch moves `first_step` to the next epoch, so an iteration that is
+    stopped early is not repeated. To resume a run, set `first_step` to the number of batches that
+    it has taken.
 
-    Raises `ConfigError` for a weight that is negative or of an unknown source, where no source has
+    Raises `ConfigError` for a weight that is negative or of an unknown source, if no source has
     both items and weight, and for batches without an item.
     """
 
@@ -55,7 +55,7 @@ class MixtureBatches(Sampler[list[int]]):
         return self.steps_per_epoch - self.first_step % self.steps_per_epoch
 
     def __iter__(self) -> Iterator[list[int]]:
-        # At the first batch, because a DataLoader with workers makes two iterators of an epoch.
+        # Moved at the first batch: a DataLoader with workers makes two iterators for an epoch.
         begin = self.first_step
         self.first_step += len(self)
         for step in range(begin, self.first_step):
@@ -87,7 +87,7 @@ def create_unified_dataloader(
     """A loader of `UnifiedBatch`es that draws three new items for each old one.
 
     `old_weight` and `new_weight` are shares of the draws, whatever the sizes. `train_head.mixture`
-    differs: it weighs each tick, so a source's share is its weight times its ticks.
+    is different: it weighs each tick, so a source's share is its weight times its ticks.
 
     `settings` go to the `UnifiedVLADataset`, the loader's `dataset`. `val_fraction` of its episodes
     are never drawn: `loader.dataset.split(val_fraction)[1]` has them. The loader's `batch_sampler`

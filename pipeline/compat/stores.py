@@ -1,6 +1,6 @@
-"""The store behind a data set: one on disk, checked, or recordings laid out in memory as one.
+"""The store behind a data set: a checked one on disk, or recordings laid out in memory as one.
 
-In memory a store has frames in the place of features, so that `gather` cuts the windows of both.
+A store in memory has frames instead of features, so `gather` cuts the windows of both.
 """
 
 import hashlib
@@ -27,9 +27,9 @@ from pipeline.store.episodes import EpisodeRows, episode_arrays
 def check_store(
     store: FeatureStore, vlm_reuse_count: int, action_hz: float | None, action_rotation: str
 ) -> None:
-    """Raise `StoreMismatch` where a store has other ticks than these settings ask for.
+    """Raise `StoreMismatch` if a store has other ticks than these settings request.
 
-    An `action_hz` of None asks for no rate; `action_rotation` auto asks for no kind of rotation.
+    An `action_hz` of None accepts any rate; `action_rotation` auto accepts any kind of rotation.
     """
     names = store.streams["action"]["names"]
     rotation = "rotvec" if "rx" in names else "euler_delta" if "da" in names else "neither"
@@ -48,7 +48,7 @@ def check_store(
 
 
 def episodes_of_format(store: FeatureStore, format: str) -> list[Episode]:
-    """The episodes of the store that were recorded in this format, all with `auto`.
+    """The episodes of the store that were recorded in this format; with `auto` all of them.
 
     Raises `StoreMismatch` where there is none.
     """
@@ -92,8 +92,8 @@ def store_in_memory(
 ) -> tuple[FeatureStore, RowFrames]:
     """These episodes as a store whose VL rows have no slots and no keys, and the rows' frames.
 
-    It is not on disk: whoever unpickles a data set reads the recordings again. Raises
-    `StoreMismatch` where two recordings are not of one embodiment.
+    It is not on disk: unpickling a data set reads the recordings again. Raises `StoreMismatch` if
+    two recordings are not of one embodiment.
     """
     recordings = [episode.recording for episode in episodes]
     embodiment = common_embodiment(
@@ -133,7 +133,7 @@ def store_in_memory(
 def read_frames(frames: RowFrames, rows: NDArray[np.int64]) -> dict[int, Frames]:
     """The frames of each of these rows; each distinct row is decoded once.
 
-    Raises `RecordingError` that names the file where one cannot be decoded.
+    Raises `RecordingError`, naming the file, if one cannot be decoded.
     """
     ranges = frames.ranges(np.unique(rows))
     return {row: views for part in ranges for row, views in part.read()}
@@ -142,7 +142,7 @@ def read_frames(frames: RowFrames, rows: NDArray[np.int64]) -> dict[int, Frames]
 def first_keys(frames: RowFrames) -> NDArray[np.uint8]:
     """(row, 16) a digest of the frames of each episode's first row, 0 for other rows.
 
-    The split takes it in place of a store's keys: it knows one recording in two formats as one.
+    The split uses them in place of a store's keys, to recognise one recording in two formats.
     """
     keys = np.zeros((len(frames.frame_time), KEY_BYTES), np.uint8)
     firsts = frames.vl_start[:-1][np.diff(frames.vl_start) > 0]

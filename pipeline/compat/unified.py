@@ -1,7 +1,7 @@
 """`QwenVLAUnified`: a policy with a vision-language model in front, as the research code named it.
 
-Features come from the model (images and an instruction), from a cache, or sample by sample from
-either. `Policy` and `pipeline.vlm.live.LiveVLM` do the work; the latter is imported when a model is
+Features come from the model (images and an instruction), from a cache, or for each sample from
+either. `Policy` and `pipeline.vlm.live.LiveVLM` do the work; `LiveVLM` is imported when a model is
 loaded.
 """
 
@@ -48,8 +48,8 @@ _ACTION_GROUPS = ("translation",) * 3 + ("rotation",) * 3 + ("gripper",)
 class QwenVLAUnified(LivePolicy[LiveVLM]):
     """Qwen2.5-VL, encoders, fusion and action expert as one `Trainable` module.
 
-    `vlm` is None until images need it or `load_vlm` is called, so that cached features need no
-    checkpoint. Unless `finetune_vl` is none, `parameters()` loads it too, for the optimizer.
+    `vlm` is None until images need it or `load_vlm` is called, so cached features need no
+    checkpoint. Unless `finetune_vl` is none, `parameters()` also loads it, for the optimizer.
     """
 
     def __init__(
@@ -88,8 +88,8 @@ class QwenVLAUnified(LivePolicy[LiveVLM]):
         translations, three rotations and the gripper; any other number are all `other`. Values are
         checked as the params of the same name are (`ValidationError`).
 
-        WARNING: without `normalization` every stream is taken as it is. Physical units (degrees,
-        millimetres, raw A-scans) train badly: give the `pipeline.policy.normalization` of the data.
+        WARNING: without `normalization` every stream is used as it is. Physical units (degrees,
+        millimetres, raw A-scans) train badly: pass the `pipeline.policy.normalization` of the data.
         """
         seen = {
             "checkpoint": vl_model_name,
@@ -241,7 +241,7 @@ class QwenVLAWithSensor(QwenVLAUnified):
 
 
 class Not_freeze_QwenVLAWithSensor(QwenVLAUnified):  # noqa: N801 (the research code's name)
-    """The unified model with the regression expert, whose every weight learns."""
+    """The unified model with the regression expert, in which every weight learns."""
 
     def __init__(self, **arguments: Any) -> None:
         arguments.setdefault("finetune_vl", "full")

@@ -1,6 +1,6 @@
-"""Which streams a policy uses: it is evaluated again with one of its streams ablated at a time.
+"""Which streams a policy uses: it is evaluated again, each time with one of its streams ablated.
 
-Where the error stays, the policy does not use the stream, or other streams tell it the same.
+If the error stays the same, the policy does not use the stream, or other streams tell it the same.
 """
 
 from collections.abc import Callable, Generator, Iterator, Sequence
@@ -26,17 +26,17 @@ from pipeline.train.training_data import groups_of
 
 DELAYS_MS = (50, 100, 200)
 MOST_TICKS = 1000
-"""Test ticks at most: every way to ablate a stream costs a pass over them."""
+"""The most test ticks: every way to ablate a stream costs a pass over them."""
 MOST_SAMPLES = 4
-"""Chunks a tick of a stochastic policy at most, for the same reason; their errors are averaged."""
+"""The most chunks a tick of a stochastic policy, for the same reason; their errors are averaged."""
 FIELDS = {
     stream: tuple(field.name for field in fields(Observation) if stream_of(field.name) == stream)
     for stream in ("sensor", "state", "features")
 }
-"""The fields of each stream: its values, which of them are real, how old they are."""
+"""The fields of each stream: its values, which of them are valid, and their ages."""
 
 Alter = Callable[[BatchIndices, Batch], Batch]
-"""Returns the batch that the policy sees; its argument stays as it is."""
+"""Returns the batch that the policy sees; does not change its arguments."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ class Ablated:
     """`zeroed`, `missing`, `shuffled` or `delayed 50 ms`."""
     comparison: Comparison
     intact: Comparison
-    """With all streams, on the same ticks: those whose episode has this stream."""
+    """The policy with all streams, on the same ticks: those whose episode has this stream."""
 
 
 @dataclass(frozen=True)
@@ -58,9 +58,9 @@ class AblationStudy:
     intact: Comparison
     ablated: tuple[Ablated, ...]
     notes: tuple[str, ...]
-    """What was not evaluated as asked, and why."""
+    """What was left out or evaluated in another way, and why."""
     samples: int
-    """Chunks a tick whose errors were averaged; 1 where the policy does not sample."""
+    """The number of chunks a tick whose errors were averaged; 1 if the policy does not sample."""
 
     def times_intact(self, ablated: Ablated) -> Figure | None:
         """The error with a stream ablated, in multiples of the intact one; None where that is 0."""
@@ -78,10 +78,10 @@ def evaluate_ablation(
 ) -> AblationStudy | None:
     """The study of this policy, which is `checkpoint.policy()`, on these test ticks.
 
-    It takes at most `MOST_TICKS` evenly spaced ticks, only ticks from which the longest delay stays
-    inside the episode; None where there is no such tick. The error of a stochastic policy is
+    It uses at most `MOST_TICKS` evenly spaced ticks, and only ticks from which the longest delay
+    stays inside the episode; None if there is no such tick. The error of a stochastic policy is
     averaged over `samples` chunks, `MOST_SAMPLES` at most. Every evaluation draws from the same
-    seed, so that both sides of a difference have the same noise. Raises as `predict`.
+    seed, so both sides of a difference have the same noise. Raises as `predict` does.
     """
     samples = min(samples, MOST_SAMPLES) if policy.stochastic else 1
     settled = _settled(store, ticks)
@@ -150,7 +150,7 @@ def feed_maker(
 def _alterations(
     checkpoint: PolicyCheckpoint, store: FeatureStore, ticks: Ticks, stream: str
 ) -> tuple[dict[str, Alter], list[str]]:
-    """Ways to alter a stream at these ticks, and notes on what is not evaluated as asked."""
+    """Ways to alter a stream at these ticks, and notes for the reader of the results."""
     ways, notes = {"zeroed": zeroed(stream, checkpoint.typical(stream))}, []
     if _knows_missing(checkpoint, store, stream):
         ways["missing"] = missing(stream)
@@ -168,7 +168,7 @@ def _alterations(
 
 
 def _knows_missing(checkpoint: PolicyCheckpoint, store: FeatureStore, stream: str) -> bool:
-    """Whether the policy was trained without this stream, too."""
+    """Whether the policy was also trained on samples without this stream."""
     if getattr(checkpoint.params, f"drop_{stream}") > 0:
         return True
     if stream == "features":
@@ -184,7 +184,7 @@ def zeroed(stream: str, mean: NDArray[np.floating]) -> Alter:
     """Every value of the stream at its training mean, which the policy sees as zeros.
 
     A raw 0 would be a reading far from all others (a pose at the robot's foot, no light): the error
-    would tell how the policy extrapolates, not how it does without the stream.
+    would show how the policy extrapolates, not how it does without the stream.
     """
 
     def alter(indices: BatchIndices, batch: Batch) -> Batch:
@@ -196,7 +196,7 @@ def zeroed(stream: str, mean: NDArray[np.floating]) -> Alter:
 
 
 def missing(stream: str) -> Alter:
-    """No reading of the stream is real: the policy's encoder gives its embedding for that."""
+    """Every reading of the stream is invalid: its encoder gives the embedding for a missing one."""
     valid = VALIDITY[stream]
     return lambda indices, batch: replace(batch, **{valid: torch.zeros_like(getattr(batch, valid))})
 
@@ -215,7 +215,7 @@ def exchanged(
 
 
 def donors_of(store: FeatureStore, ticks: Ticks, stream: str, seed: int = 0) -> Ticks | None:
-    """For each of these ascending ticks, one of another episode among them, drawn evenly.
+    """For each of these ascending ticks, one of them from another episode, drawn uniformly.
 
     A tick whose episode lacks the stream is no donor and keeps itself. None where fewer than two
     episodes have the stream.
@@ -226,7 +226,7 @@ def donors_of(store: FeatureStore, ticks: Ticks, stream: str, seed: int = 0) -> 
     size = np.searchsorted(episode, episode, side="right") - first
     if len(episode) == 0 or (size == len(episode)).any():
         return None
-    # A place among the ticks of other episodes: places behind the own episode move up by its size.
+    # An index into the ticks of other episodes: from the own episode on, it moves up by its size.
     drawn = np.random.default_rng(seed).integers(0, len(episode) - size)
     drawn = np.where(drawn < first, drawn, drawn + size)
     donors = ticks.copy()
@@ -256,7 +256,7 @@ def delays(store: FeatureStore, stream: str) -> dict[str, Lags]:
 
 
 def _emptied(windows: Windows, stream: str) -> list[str]:
-    """Notes on delays beyond the seconds that a stream's window reaches back."""
+    """Notes on delays that are longer than a stream's window in seconds."""
     oldest_s = vars(windows).get(f"{stream}_window_s") or np.inf
     return [
         f"{stream} delayed {ms} ms: older than its window of {1000 * oldest_s:.0f} ms, so the "

@@ -1,7 +1,7 @@
 """Baselines: simple rules, fitted on training ticks, that a policy has to beat.
 
-They learn a few numbers a dimension, except the nearest neighbour, which repeats the most similar
-recording. A policy that is no better has only learnt to look up.
+They learn a few numbers for each dimension, except the nearest neighbour, which repeats the actions
+of the most similar training tick. A policy that is no better than that has only learnt to look up.
 """
 
 from collections.abc import Iterator
@@ -25,11 +25,11 @@ from pipeline.train.predictions import Actions
 BASELINES = ("zero_action", "median_action", "repeat_last", "linear_fit", "nearest_neighbour")
 METHODS = ("policy", *BASELINES)
 NEIGHBOURS = 20_000
-"""Training ticks at most among which the nearest is searched."""
+"""The most training ticks among which the nearest is searched."""
 _FITTED = 200_000
-"""Training ticks at most that the linear fit is fitted on."""
+"""The most training ticks on which the linear fit is fitted."""
 _WIDTH = 256
-"""Width at most to which features are projected."""
+"""Features that are wider than this are projected to this width."""
 _ROWS = 512
 """VL rows read at a time."""
 
@@ -61,12 +61,12 @@ class Baselines:
     def act(self, ticks: Ticks) -> dict[str, Actions]:
         """The actions of each of `BASELINES` at these ticks: (tick, horizon or 1, action_dim).
 
-        `zero_action`: no motion. `median_action`: that of the training ticks. `repeat_last`: the
-        action of the tick before. `linear_fit`: a linear function of all dimensions of the two
-        actions before, by least squares for each step of the chunk. Before an episode's first tick
-        actions count as zero where they are deltas or velocities, and as the median where they are
-        absolute: zero would be a pose far from all others. `nearest_neighbour`: the chunk of
-        the training tick whose newest state reading and features are most alike.
+        `zero_action`: no motion. `median_action`: the median of the training ticks. `repeat_last`:
+        the action of the previous tick. `linear_fit`: a linear function of all dimensions of the
+        two previous actions, by least squares for each step of the chunk. Before an episode's first
+        tick, actions count as zero if they are deltas or velocities, and as the median if they are
+        absolute: zero would be a pose far from all others. `nearest_neighbour`: the chunk of the
+        training tick whose newest state reading and features are most alike.
         """
         zero = np.zeros((len(ticks), 1, len(self._median)), np.float32)
         nearest = self._neighbours.nearest(ticks)
@@ -83,12 +83,12 @@ class Baselines:
         }
 
     def _past(self, ticks: Ticks) -> Values:
-        """The two actions before, and a constant."""
+        """The two previous actions, and a constant."""
         two = [self._before(ticks, back) for back in (1, 2)]
         return np.concatenate([*two, np.ones((len(ticks), 1))], axis=1)
 
     def _before(self, ticks: Ticks, back: int) -> Values:
-        """The action `back` ticks before, or its replacement before the episode's start."""
+        """The action `back` ticks earlier; before the episode's start, what replaces it."""
         absolute = self._store.streams["action"]["kind"] == "absolute"
         start = self._median if absolute else np.zeros_like(self._median)
         first = self._store.array("episode/tick_start")[self._store.episode_of(ticks)]
@@ -97,11 +97,12 @@ class Baselines:
 
 
 class Neighbours:
-    """Training ticks by their newest state reading and the features of their VL row.
+    """Finds training ticks by their newest state reading and the features of their VL row.
 
-    Angles count by sine and cosine. States and features are z-scored; wide features are projected
-    at random (Achlioptas 2003), which keeps distances. Both parts are then scaled to the same mean
-    square length, so that they weigh equally. A tick that lacks a part has its mean, which is zero.
+    Angles are compared by sine and cosine. States and features are z-scored; wide features are
+    projected at random (Achlioptas 2003), which keeps distances. Both parts are then scaled to the
+    same mean square length, so they have equal weight. A tick that lacks a part gets the mean of
+    that part, which is zero.
     """
 
     def __init__(
@@ -109,7 +110,7 @@ class Neighbours:
     ) -> None:
         self._store, self._ticks, self._statistics = store, ticks, features
         kinds = channel_kinds(store.streams["state"]["names"], store.streams["state"]["units"])
-        # As policies take it, relative to itself, a reading would have no rotation.
+        # Policies see rotations relative to the newest reading: for it, they would always be zero.
         self._kinds: list[Kind] = ["deg" if kind == "rotation" else kind for kind in kinds]
         states, known = self._newest_states(ticks)
         self._scaler = StandardScaler().fit(states[known]) if states[known].size else None
@@ -144,7 +145,7 @@ class Neighbours:
         return parts
 
     def _newest_states(self, ticks: Ticks) -> tuple[Values, NDArray[np.bool_]]:
-        """(tick, expanded channel), of zeros without a reading, and where there is one."""
+        """(tick, expanded channel), made of zeros without a reading, and where there is one."""
         values = self._store.array("state/values")
         end = self._store.array("tick/state_end")[ticks]
         known = end > self._store.array("episode/state_start")[self._store.episode_of(ticks)]
@@ -155,11 +156,11 @@ class Neighbours:
     def _features(self, rows: NDArray[np.int64], statistics: ChannelStatistics) -> Iterator[Values]:
         """The plain features of these VL rows, z-scored and projected, block by block."""
         slots = self._store.feature_shape[0]
-        for some in np.split(rows, range(_ROWS, len(rows), _ROWS)):
-            values = widen(self._store.array("vl/features")[some][:, :slots])
-            valid = self._store.array("vl/slot_valid")[some][:, :slots].astype(bool)
+        for block in np.split(rows, range(_ROWS, len(rows), _ROWS)):
+            values = widen(self._store.array("vl/features")[block][:, :slots])
+            valid = self._store.array("vl/slot_valid")[block][:, :slots].astype(bool)
             scaled = (values - statistics.mean) / statistics.scale
-            flat = np.where(valid[..., None], scaled, 0.0).reshape(len(some), -1)
+            flat = np.where(valid[..., None], scaled, 0.0).reshape(len(block), -1)
             yield flat if self._projection is None else self._projection.transform(flat)
 
 

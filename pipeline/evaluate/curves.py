@@ -29,7 +29,7 @@ class TrainingCurves:
     curves: Mapping[str, TrainingCurve]
     """By name: `train/loss`, `val/error`, `lr`, …"""
     absence: str = ""
-    """One sentence where there are none, naming the path."""
+    """If there are none, one sentence that names the path."""
 
 
 def read_curves(checkpoint: PolicyCheckpoint) -> TrainingCurves:

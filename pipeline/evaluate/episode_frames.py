@@ -1,7 +1,7 @@
 """The frames that a policy's features were computed from, read from the recording itself.
 
-A store holds no frames, but the path and file digests of each episode's recording and the capture
-times of each VL row's frames.
+A store holds no frames. It holds the path and file digests of each episode's recording, and the
+capture times of each VL row's frames.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -28,13 +28,13 @@ class EpisodeFrames:
     frames: Mapping[str, Sequence[Frame]]
     """By view, one for each requested VL row: (height, width, 3), RGB."""
     absence: str = ""
-    """One sentence where there are no frames, naming the path."""
+    """If there are no frames, one sentence that names the path."""
 
 
 def shown_ticks(store: FeatureStore, ticks: Ticks, count: int) -> Ticks:
     """At most `count` of these ticks of one episode, evenly spread.
 
-    Ticks at which a VL row begins, where there are any: their frames are the newest.
+    If there are ticks at which a VL row begins, only these are taken: their frames are the newest.
     """
     rows = store.array("tick/vl_row")[ticks]
     before = store.array("tick/vl_row")[np.maximum(ticks - 1, 0)]
@@ -51,8 +51,8 @@ def read_episode_frames(
 ) -> EpisodeFrames:
     """The frames of these store-global VL rows of one episode, ascending.
 
-    A relative path of the store lies under `root`. A recording whose files have changed, by their
-    digests, gives no frame: each file is read whole, unless `digest_of` remembers it.
+    Relative paths in the store are under `root`. A recording gives no frame if the digests of its
+    files have changed. For its digest each file is read whole, unless `digest_of` remembers it.
     """
     path = root / episode.path
     if not path.is_dir():

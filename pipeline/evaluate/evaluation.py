@@ -1,4 +1,4 @@
-"""A policy evaluated on its test ticks, and the document that says on what."""
+"""A policy evaluated on its test ticks, and the document that says what was evaluated on what."""
 
 import json
 from collections.abc import Callable, Mapping
@@ -27,7 +27,7 @@ from pipeline.train.split import hash64
 from pipeline.train.training_data import find_ticks, groups_of, source_of
 
 JUDGED = "judged.json"
-"""Its name in the folder of an evaluation, beside metrics.json."""
+"""The document's name in the folder of an evaluation, beside metrics.json."""
 
 
 @dataclass(frozen=True)
@@ -35,16 +35,16 @@ class Evaluation:
     """A policy and the results of its evaluation."""
 
     name: str
-    """Of the checkpoint, as the user wrote it."""
+    """The name of the checkpoint, as the user wrote it."""
     checkpoint: PolicyCheckpoint
     store: FeatureStore
     comparison: Comparison
     predictions: Predictions
     energy: Figure | None
-    """The energy score of the policy's samples; None of a policy that does not sample."""
+    """The energy score of the policy's samples; None if the policy does not sample."""
     study: AblationStudy | None
     judged: Mapping[str, Any]
-    """`judged_document`."""
+    """What `judged_document` returns."""
     curves: TrainingCurves
     recordings: Path
     """The root of the relative paths of the store's recordings."""
@@ -59,11 +59,11 @@ def evaluate_checkpoint(
     recordings: Path,
     say: Callable[[str], None],
 ) -> Evaluation:
-    """The policy of the checkpoint in `folder`, on its test ticks of a store it fits.
+    """Evaluate the policy of the checkpoint in `folder` on its test ticks in a store that it fits.
 
-    `say` first prints what is evaluated on what. Raises `ConfigError` where more steps would be
-    executed than a chunk has, `CheckpointMismatch` as `find_ticks`, and `NumericsError` as
-    `predict`.
+    `say` first prints what is evaluated on what. Raises `ConfigError` if more steps would be
+    executed than a chunk has, `CheckpointMismatch` as `find_ticks` does, and `NumericsError` as
+    `predict` does.
     """
     horizon = checkpoint.params.horizon
     if wanted.execute > horizon:
@@ -130,10 +130,10 @@ def judged_document(
 ) -> dict[str, Any]:
     """What was evaluated (`policy`), how it was sampled (`drawn`) and on what (`on`), as JSON.
 
-    Evaluations may stand in one table where their `on` is equal, whatever features the policies
-    saw, and where `drawn` is equal too among stochastic policies: the best of fewer samples errs
-    more, and a batch shares its noise. `drawn` is null for policies that do not sample. The
-    `recipe` is equal for trainings that differ by their seed or fold alone.
+    Evaluations may be in one table if their `on` is equal, whatever features the policies saw.
+    Stochastic policies also need an equal `drawn`: the best of fewer samples errs more, and a batch
+    shares its noise. `drawn` is null for policies that do not sample. The `recipe` is equal for
+    trainings that differ only in their seed or fold.
     """
     params = checkpoint.params
     source = source_of(store)

@@ -1,4 +1,4 @@
-"""Evaluations of several experiments, read back where they may stand in one table."""
+"""Reads the evaluations of several experiments back, if they may be compared in one table."""
 
 import csv
 import re
@@ -25,14 +25,15 @@ from pipeline.evaluate.tables import GROUPS, HEADINGS
 SPANS = {"executed": "what is executed", "overall": "the whole chunk"}
 """The parts of a chunk that are judged: the name in `GROUPS`, and the words for it."""
 _SAME = 1e-4
-"""Relative difference of two baselines that rounding on another machine explains."""
+"""The relative difference of two baselines that rounding on another machine can explain."""
 _OF_FEATURES = "nearest_neighbour"
 """The baseline that sees features, and so differs between stores of the same recordings."""
 _SHARED = {
     "on": ("on the same test ticks, all folds together,", "recordings and folds"),
     "drawn": ("from as many samples and ticks a batch", "evaluate.samples and evaluate.batch_size"),
 }
-"""By key of `JudgedDocument`: what evaluations in one table share, and what makes them share it."""
+"""The keys of `JudgedDocument` in which evaluations of one table must agree. For each: words for
+what they share, and which params must be the same."""
 
 
 _REPORT = Border(
@@ -43,7 +44,7 @@ _REPORT = Border(
 
 
 class JudgedPolicy(Document):
-    """What of an evaluated policy is compared."""
+    """The part of `JudgedDocument` about the policy."""
 
     model_type: ModelType
     fusion_strategy: FusionStrategy
@@ -51,11 +52,11 @@ class JudgedPolicy(Document):
     samples: Annotated[int, Field(ge=1)]
     seed: int
     recipe: Text
-    """Equal for trainings that differ by their seed or fold alone."""
+    """Equal for trainings that differ only in their seed or fold."""
 
 
 class JudgedOn(Document):
-    """What it was evaluated on; all entries are compared."""
+    """What the policy was evaluated on; all entries are compared."""
 
     model_config = ConfigDict(extra="allow")
     test: dict[Text, JsonValue]
@@ -71,27 +72,27 @@ class JudgedDocument(Document):
 
 @dataclass(frozen=True, eq=False)
 class Experiment:
-    """The evaluations, read back, of policies whose training differs by its seed or fold alone."""
+    """The evaluations, read back, of policies whose trainings differ only in their seed or fold."""
 
     name: str
     judged: JudgedDocument
-    """Of the first of them; its test is that of all folds."""
+    """The document of the first of them; its `test` is that of all folds."""
     seeds: tuple[int, ...]
     groups: tuple[str, ...]
-    """Of test recordings, in order; those of all folds."""
+    """Groups of test recordings of all folds, in order."""
     entries: Mapping[str, NDArray[np.float64]]
-    """Of each of `SPANS`: (group,) recorded actions that were judged."""
+    """By one of `SPANS`: (group,) number of recorded actions that were judged."""
     errors: Mapping[tuple[str, str], NDArray[np.float64]]
-    """Of each of `METHODS` in each of `SPANS`: (seed, group) mean absolute error [training std]."""
+    """By one of `METHODS` and one of `SPANS`: (seed, group) mean absolute error [training std]."""
     folds: int = 1
-    """Evaluations that are test for other groups each, and taken together."""
+    """Number of evaluations that are taken together, each with other test groups."""
 
     def by_seed(self, span: str, method: str = "policy") -> NDArray[np.float64]:
         """(seed,) errors over all groups [training std]."""
         return np.average(self.errors[method, span], axis=1, weights=self.entries[span])
 
     def error(self, span: str, method: str = "policy") -> Figure:
-        """The mean over the seeds; its interval is over groups of recordings alone."""
+        """The mean over the seeds; its interval is over groups of recordings only."""
         return Figure.of(float(self.by_seed(span, method).mean()), self._draws(span, method))
 
     def best_baseline(self, span: str) -> str:
@@ -99,7 +100,7 @@ class Experiment:
         return min(BASELINES, key=lambda method: self.by_seed(span, method).mean())
 
     def minus(self, other: "Experiment", span: str, method: str = "policy") -> Figure:
-        """The policy's error less that of another experiment's method, by the paired bootstrap."""
+        """The policy's error minus that of another experiment's method, by the paired bootstrap."""
         value = self.by_seed(span).mean() - other.by_seed(span, method).mean()
         own, others = self._draws(span, "policy"), other._draws(span, method)
         return Figure.of(float(value), None if own is None or others is None else own - others)
@@ -112,10 +113,10 @@ class Experiment:
 def read_experiments(reports: Path) -> tuple[Experiment, ...]:
     """The evaluations in the folders of `reports`, ordered by expert, fusion and name.
 
-    Evaluations whose trainings differ by the seed or the fold alone are one experiment. Other
-    folders, such as the logs of a training, are skipped. Raises `ConfigError` where there is none,
-    where one lacks a file or cannot be read, where they were not evaluated on the same ticks (all
-    folds together), and where stochastic policies were not sampled alike.
+    Evaluations whose trainings differ only in their seed or fold are one experiment. Other folders,
+    such as the logs of a training, are skipped. Raises `ConfigError` if there is no evaluation, if
+    one lacks a file or cannot be read, if they were not evaluated on the same ticks (all folds
+    together), or if stochastic policies were not sampled alike.
     """
     folders = [
         folder
@@ -143,14 +144,14 @@ def read_experiments(reports: Path) -> tuple[Experiment, ...]:
 
 
 def best_experiment(experiments: Sequence[Experiment], span: str) -> Experiment:
-    """The one with the lowest error."""
+    """The experiment with the lowest error."""
     return min(experiments, key=lambda experiment: experiment.error(span).value)
 
 
 def experiment_table(experiments: Sequence[Experiment], span: str) -> Table:
     """A row for each experiment and baseline, with mean absolute errors and their differences.
 
-    The baseline that sees features has its lowest error of all experiments.
+    Each baseline has its lowest error of all experiments; only the one that sees features varies.
     """
     best = best_experiment(experiments, span)
     heading = f"{SPANS[span]} [training std]"
@@ -183,7 +184,7 @@ def experiment_table(experiments: Sequence[Experiment], span: str) -> Table:
 
 
 def experiment_csv(experiments: Sequence[Experiment]) -> Table:
-    """An experiment a row, with the numbers of both spans in columns."""
+    """A row for each experiment, with the numbers of both spans in columns."""
     own = ("model_type", "fusion_strategy", "parameters", "samples")
     rows: list[dict[str, Any]] = []
     for experiment in experiments:
@@ -215,9 +216,9 @@ def _apart(name: str, apart: Figure) -> dict[str, Any]:
 
 
 def _pooled(run: Sequence[Experiment]) -> Sequence[Experiment]:
-    """The evaluations of the folds of one training as one, with the test groups of all.
+    """Join the evaluations of one training's folds into one, with the test groups of all.
 
-    Where two of them share a test group they are no folds, and stay as they are.
+    If two of them share a test group, they are not folds and stay as they are.
     """
     first, *others = run
     groups = np.array([group for fold in run for group in fold.groups])
@@ -243,7 +244,7 @@ def _pooled(run: Sequence[Experiment]) -> Sequence[Experiment]:
 
 
 def _merged(of_seeds: Sequence[Experiment]) -> Experiment:
-    """One experiment of evaluations of one recipe, named as the first less its seed."""
+    """Join evaluations of one recipe into one experiment, named as the first without its seed."""
     first, *others = of_seeds
     if not others:
         return first
@@ -323,7 +324,7 @@ def _check_baselines(reports: Path, experiment: Experiment, other: Experiment) -
 
 
 def _order(experiment: Experiment) -> tuple[int, int, str]:
-    """The order of params.yaml's choices."""
+    """Sorts experiments in the order of params.yaml's choices, then by name."""
     experts, fusions = get_args(ModelType), get_args(FusionStrategy)
     policy = experiment.judged.policy
     expert, fusion = experts.index(policy.model_type), fusions.index(policy.fusion_strategy)

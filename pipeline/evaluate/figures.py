@@ -1,7 +1,7 @@
 """Figures with their 95 % intervals: errors, differences and ratios, by one bootstrap over groups.
 
-Ticks of one recording are alike, so the unit that is drawn anew is a group of recordings (Efron and
-Tibshirani 1993, chapters 6 and 13). All figures draw the same groups: the difference of two
+Ticks of one recording are alike, so the bootstrap draws whole groups of recordings (Efron and
+Tibshirani 1993, chapters 6 and 13). All figures draw the same groups, so the difference of two
 figures' draws is the paired bootstrap.
 """
 
@@ -33,15 +33,15 @@ class Figure:
 
     @classmethod
     def of(cls, value: float, draws: Draws | None) -> "Figure":
-        """With the 2.5th and 97.5th percentiles of its draws (draw,); NaN draws are left out."""
+        """The value with the 2.5th and 97.5th percentiles of its draws (draw,), NaN left out."""
         if draws is None or np.isnan(draws).all():
             return cls(value)
         return cls(value, *np.nanpercentile(draws, [2.5, 97.5]).tolist())
 
     def text(self, sign: str = "") -> str:
-        """As `0.279 (0.251–0.304)`, all in as many decimals as give the largest three digits.
+        """The figure as `0.279 (0.251–0.304)`; with a `sign` of `+`, as `-0.02 (-0.05 to +0.01)`.
 
-        With a `sign` of `+`, as `-0.02 (-0.05 to +0.01)`.
+        All numbers have the same decimals, so many that the largest has three digits.
         """
         ends = [end for end in (self.low, self.high) if end is not None]
         largest = max(map(abs, (self.value, *ends)))
@@ -53,7 +53,7 @@ class Figure:
 
     @property
     def resolved(self) -> bool | None:
-        """Of a difference: whether its interval leaves 0 out; None without one."""
+        """For a difference: whether its interval excludes 0; None without an interval."""
         return None if self.low is None or self.high is None else not self.low <= 0 <= self.high
 
     @property
@@ -62,19 +62,19 @@ class Figure:
         return {None: "", True: "resolved", False: "not resolved"}[self.resolved]
 
     def columns(self, name: str) -> dict[str, float | None]:
-        """As columns of a table."""
+        """The figure as columns of a table."""
         return {name: self.value, f"{name}_low": self.low, f"{name}_high": self.high}
 
 
 @dataclass(frozen=True)
 class Rivalry:
-    """The policy beside the baseline that is best at this very figure."""
+    """The policy, compared with the baseline that is best in this very figure."""
 
     policy: Figure
     best: str
     baseline: Figure
     difference: Figure
-    """The policy's error less the baseline's, by the paired bootstrap."""
+    """The policy's error minus the baseline's, by the paired bootstrap."""
 
     @property
     def ratio(self) -> float | None:
@@ -100,7 +100,7 @@ def by_group(comparison: Comparison, values: NDArray[np.floating]) -> Errors:
 def sums_by_group(
     comparison: Comparison, method: str, group: ActionGroup | None = None
 ) -> tuple[Errors, Errors]:
-    """The sums whose ratio is `Comparison.error`, and the entries they are over: (group,)."""
+    """Sums of errors and numbers of entries, both (group,); their ratio is `Comparison.error`."""
     absolute = comparison.scores[method].absolute.sum(axis=1) @ comparison.weights(group)
     return by_group(comparison, absolute), by_group(comparison, comparison.cells.entries.sum(1))
 
@@ -128,7 +128,7 @@ def rivalry(comparison: Comparison, group: ActionGroup | None = None) -> Rivalry
 def times(over: Comparison, under: Comparison) -> Figure | None:
     """The policy's overall error in `over` in multiples of that in `under`, on the same ticks.
 
-    By the paired bootstrap. None where the latter is 0.
+    The interval is by the paired bootstrap. None if the error in `under` is 0.
     """
     (sums, _), (others, _) = (sums_by_group(which, "policy") for which in (over, under))
     if not others.any():
@@ -137,13 +137,13 @@ def times(over: Comparison, under: Comparison) -> Figure | None:
 
 
 def mean_over_ticks(values: NDArray[np.floating], groups: NDArray[np.str_]) -> Figure:
-    """The mean of (tick,) `values` whose ticks are of these `groups`."""
+    """The mean of `values` (tick,); its interval draws the `groups` (tick,) of the ticks."""
     _, place, counts = np.unique(groups, return_inverse=True, return_counts=True)
     return Figure.of(float(values.mean()), draws(summed(values, place), counts))
 
 
 def draws(sums: Errors, counts: NDArray[np.number]) -> Draws | None:
-    """Ratios (draw,) of sums over groups, both (group,); None of too few groups."""
+    """Bootstrap ratios (draw,) of sums to counts, both (group,); None with too few groups."""
     if len(sums) < FEWEST_GROUPS:
         return None
     return bootstrap_means(sums[:, None], counts[:, None].astype(np.float64))[:, 0]
@@ -152,11 +152,11 @@ def draws(sums: Errors, counts: NDArray[np.number]) -> Draws | None:
 def bootstrap_means(
     sums: NDArray[np.floating], counts: NDArray[np.floating], draws: int = DRAWS, seed: int = 0
 ) -> NDArray[np.float64]:
-    """Means (draw, figure) over as many groups, drawn with replacement.
+    """Means (draw, figure), each over as many groups as there are, drawn with replacement.
 
-    `sums` (group, figure) and `counts` (group, figure), or (group, 1) for all figures, add up to
-    sum / count. NaN where a draw counts nothing. The same seed draws the same groups, whatever
-    the figures.
+    A mean is the total of the drawn `sums` (group, figure), divided by the total of the drawn
+    `counts` (group, figure), or (group, 1) for all figures. NaN if a draw counts nothing. The same
+    seed draws the same groups, whatever the figures.
     """
     sums, counts = np.asarray(sums, np.float64), np.asarray(counts, np.float64)
     times_drawn = _draw(len(sums), draws, seed)
@@ -178,5 +178,5 @@ def with_unit(name: str, unit: str) -> str:
 
 
 def rounded(values: Mapping[str, float | None]) -> dict[str, float]:
-    """For a JSON document: 6 significant digits, without what has no value."""
+    """The values for a JSON document: with 6 significant digits, without those that are None."""
     return {key: float(f"{value:.6g}") for key, value in values.items() if value is not None}

@@ -53,7 +53,7 @@ def _phases(store: FeatureStore, episode: Episode, columns: list[int]) -> NDArra
 def _motion(store: FeatureStore, episode: Episode) -> NDArray[np.floating]:
     """(tick,) the length of each recorded motion: of the translation, else of all but grippers.
 
-    The motion of an absolute action is the way from the action before.
+    The motion of an absolute action is its difference from the previous action.
     """
     action = store.streams["action"]
     groups = np.array(action_groups(action["names"], action["units"]))

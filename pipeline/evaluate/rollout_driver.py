@@ -1,7 +1,8 @@
 """A policy drives the simulated insertion closed loop, in this process or over the wire.
 
-One loop (`_Driver.drive`) steps several environments together; two drivers differ in who answers
-with chunks. The same seeds give the same figures, bit for bit on one machine.
+One loop (`_Driver.drive`) steps several environments together. It has two drivers: one gets its
+chunks from a policy in this process, the other from a server. The same seeds give the same figures,
+bit for bit on one machine.
 """
 
 from abc import ABC, abstractmethod
@@ -47,9 +48,9 @@ SIDE_BY_SIDE: Final = 50
 """Environments that are stepped together and share passes of a model in this process."""
 
 Act = Callable[[Observation, Generators, Guide | None], Tensor]
-"""Answers observations with chunks (robot, horizon, action), as `Policy.act`."""
+"""Answers observations with chunks (robot, horizon, action), as `Policy.act` does."""
 Seen = TypeVar("Seen")
-"""What a pass of the model gives a robot."""
+"""The result of a pass of the model for one robot."""
 Chunk = NDArray[np.float32]
 Readings = Mapping[str, NDArray[Any]]
 
@@ -63,14 +64,15 @@ def roll_out(
     say: Callable[[str], None] = lambda line: None,
     act: Act | None = None,
 ) -> Rollouts:
-    """Episodes of the policy, late and with a stream ablated, and of the demonstrator.
+    """Run the policy, also with latencies and with streams ablated, and the demonstrator.
 
-    `act` answers in place of the policy's own: its exported head. `say` prints a line for each
-    controller whose episodes have ended. `load_features` is called where the policy looks at
-    features, after everything else was checked; the model proves that it gives the policy's
-    features before the first episode (`prove`). Raises `CheckpointMismatch` where the phantom lacks
-    what the policy was trained on, and `ConfigError` for an instruction that the policy was not
-    trained on, for chunking that its expert cannot do and for more steps than a chunk has.
+    `act` answers in place of the policy's own `act`: it is that of an exported head. `say` prints a
+    line for each controller when its episodes have ended. If the policy uses features,
+    `load_features` is called after everything else was checked, and before the first episode the
+    model proves that it gives the policy's features (`prove`). Raises `CheckpointMismatch` where
+    the phantom lacks what the policy was trained on, and `ConfigError` for an instruction that the
+    policy was not trained on, for chunking that its expert cannot do and for more steps than a
+    chunk has.
     """
     shape = checkpoint.shape
     widths = {"action": shape.action_dim, "state": shape.state_dim, "sensor": shape.sensor_channels}
@@ -96,11 +98,11 @@ def roll_out(
 def roll_out_served(
     server: PolicyClient, wanted: RolloutParams, say: Callable[[str], None] = lambda line: None
 ) -> Rollouts:
-    """Episodes of a served policy, one after another, and of the demonstrator.
+    """Run a served policy, one episode after another, and the demonstrator.
 
-    The simulation waits for each answer, and holds frames back for a simulated latency: with
-    `rollout.execute` 1 a policy does what it does in `roll_out`, bit for bit where both compute one
-    row at a time on one thread. No stream is ablated. Raises as `roll_out`.
+    The simulation waits for each answer, and delays frames to simulate a latency. With
+    `rollout.execute` 1 a policy does the same as in `roll_out`, bit for bit if both compute one row
+    at a time on one thread. No stream is ablated. Raises as `roll_out` does.
     """
     metadata = server.metadata
     streams = {name: metadata["streams"].get(name) for name in ("action", "state", "sensor")}
@@ -117,8 +119,8 @@ def roll_out_served(
 def _refuse_other_robot(source: Mapping[str, Any], widths: Mapping[str, int]) -> None:
     """Raise `CheckpointMismatch` where the phantom lacks what a policy was trained on.
 
-    `source` has `streams` and `action_hz`; `widths` are those of action, state and sensor, 0 of a
-    stream that the policy does not look at.
+    `source` has `streams` and `action_hz`; `widths` are those of action, state and sensor, 0 for a
+    stream that the policy does not use.
     """
     streams, hz = source["streams"], source["action_hz"]
     kind, own = streams["action"]["kind"], {"action": (7,), "state": (0, 12), "sensor": (0, 1026)}
@@ -159,7 +161,7 @@ def _run_episodes(
     settings: Mapping[str, Any],
     say: Callable[[str], None],
 ) -> Rollouts:
-    """Episodes of the policy, with each latency and then ablation, and of the demonstrator.
+    """Run the policy with each latency, then with each ablation, and the demonstrator.
 
     `source` is what the policy was trained on; `settings` describe it, its `checkpoint` among them.
     """
@@ -234,21 +236,21 @@ class _Robot(ABC, Generic[Seen]):
     environment: InsertionEnvironment
     loop: ControlLoop
     latency_s: float
-    """What a pass of the model takes."""
+    """How long a pass of the model takes."""
     stop: str | None = field(default=None, init=False)
     time_s: float = field(default=0.0, init=False)
     under_way: tuple[float, Seen] | None = field(default=None, init=False)
-    """When the model's pass that has begun ends, and what it gives."""
+    """When the current pass of the model ends, and its result; None without a pass."""
 
     def sense(self, readings: Readings) -> None:
-        """Begin a tick with what was read since the last."""
+        """Begin a tick with the readings since the last one."""
         self.loop.begin_tick()
         self.time_s = float(readings["time"][0])
         self.remember(readings)
         self._end_pass()
 
     def see(self, seen: Seen) -> None:
-        """Begin a pass of the model, whose answer is there `latency_s` from now."""
+        """Begin a pass of the model; its result is ready `latency_s` from now."""
         self.loop.pass_began()
         self.under_way = self.time_s + self.latency_s, seen
         self._end_pass()
@@ -265,17 +267,17 @@ class _Robot(ABC, Generic[Seen]):
 
     @abstractmethod
     def take(self, seen: Seen) -> None:
-        """Keep what a pass gives for the next observation."""
+        """Keep the result of a pass for the next observation."""
 
     def plan(self, chunk: Chunk) -> None:
-        """Take the chunk that was asked for; one that is not all numbers stops the robot."""
+        """Take the requested chunk; a NaN or an infinity in it stops the robot."""
         try:
             self.loop.plan(chunk)
         except SafeStop as stop:
             self.stop = f"safe stop: {stop}"
 
     def step(self) -> None:
-        """Act for one tick; stand still until the first chunk is there."""
+        """Act for one tick; stand still until the first chunk has come."""
         action = self.loop.action()
         still = np.zeros(self.environment.action_space.shape or ())
         self.sense(self.environment.step(still if action is None else action)[0])
@@ -293,7 +295,7 @@ class _Driver(ABC, Generic[AnyRobot]):
     """Runs a policy on robots to the ends of their episodes."""
 
     side_by_side: int
-    """Robots that it drives together, at most."""
+    """The most robots that it drives together."""
 
     def drive(
         self,
@@ -302,9 +304,9 @@ class _Driver(ABC, Generic[AnyRobot]):
         ablation: RolloutAblation | None,
         ended: Callable[[], Any],
     ) -> list[str | None]:
-        """Why each robot stopped safely, or None; `ended` is called for each that ends.
+        """Run the episodes to their ends; returns why each robot stopped safely, or None.
 
-        A pass of the model takes `latency_s`.
+        A pass of the model takes `latency_s`. `ended` is called for each episode that ends.
         """
         robots = [self.begin(environment, latency_s) for environment in environments]
         for robot in robots:
@@ -335,12 +337,12 @@ class _Driver(ABC, Generic[AnyRobot]):
 
 @dataclass
 class _LocalRobot(_Robot[SeenFeatures]):
-    """A robot whose memory is here; its noise comes from a generator of its own."""
+    """A robot whose memory is in this process; it has its own generator of noise."""
 
     memory: RobotMemory
     generator: torch.Generator
     first: dict[str, NDArray[Any]] = field(default_factory=dict[str, NDArray[Any]])
-    """What a frozen stream was first."""
+    """The fields of a frozen stream as they were first."""
 
     def remember(self, readings: Readings) -> None:
         """Keep them in the memory."""
@@ -353,9 +355,9 @@ class _LocalRobot(_Robot[SeenFeatures]):
 
 @dataclass(frozen=True)
 class _LocalDriver(_Driver[_LocalRobot]):
-    """Drives by a policy in this process; `features` is the model, None where it needs none.
+    """Drives robots by a policy in this process; `features` is the model, None if it needs none.
 
-    A robot draws from a generator of its own seed, so that it does as it would alone.
+    Each robot draws noise from a generator with its own seed, so it acts as it would alone.
     """
 
     side_by_side = SIDE_BY_SIDE
@@ -378,7 +380,7 @@ class _LocalDriver(_Driver[_LocalRobot]):
     def chunks(
         self, active: Sequence[_LocalRobot], ablation: RolloutAblation | None
     ) -> Iterable[tuple[_LocalRobot, Chunk]]:
-        """One pass of the model for all whose frames are due, one of the head for all chunks."""
+        """One pass of the model for all due frames, then one of the head for all due chunks."""
         self._look([robot for robot in active if robot.loop.frames_due])
         due = [
             robot
@@ -403,8 +405,8 @@ class _LocalDriver(_Driver[_LocalRobot]):
     def _act(self, due: Sequence[_LocalRobot], ablation: RolloutAblation | None) -> Chunk:
         """The chunks (robot, horizon, action).
 
-        A stream that is off keeps its true ages and gaps; one that is frozen stays all as it was
-        first.
+        A stream that is off keeps its true ages and gaps; all fields of a frozen one stay as they
+        were first.
         """
         guides = [robot.loop.ask() for robot in due]
         fields = [robot.memory.observation() for robot in due]
@@ -427,7 +429,7 @@ class _LocalDriver(_Driver[_LocalRobot]):
 
 @dataclass
 class _ServedRobot(_Robot[Mapping[str, Any]]):
-    """A robot whose memory is the server's, which gets frames as late as the model is."""
+    """A robot whose memory is on the server; the server gets frames with the model's latency."""
 
     sees: bool
     """Whether the server has frames of this episode, or needs none."""
@@ -437,17 +439,17 @@ class _ServedRobot(_Robot[Mapping[str, Any]]):
     """The newest frames that are not sent yet, with their times."""
 
     def remember(self, readings: Readings) -> None:
-        """They go out with the next observation."""
+        """Keep them, to send them with the next observation."""
         self.unsent.append(readings)
 
     def take(self, seen: Mapping[str, Any]) -> None:
-        """They go out with the next observation."""
+        """Keep them, to send them with the next observation."""
         self.frames, self.sees = seen, True
 
 
 @dataclass(frozen=True)
 class _ServedDriver(_Driver[_ServedRobot]):
-    """Drives by a policy server, whose connection is the memory of one robot."""
+    """Drives robots by a policy server, which remembers one robot for each connection."""
 
     side_by_side = 1
     server: PolicyClient
@@ -467,10 +469,10 @@ class _ServedDriver(_Driver[_ServedRobot]):
     def chunks(
         self, active: Sequence[_ServedRobot], ablation: RolloutAblation | None
     ) -> Iterable[tuple[_ServedRobot, Chunk]]:
-        """The server's answers, each waited for."""
+        """The robots whose chunk is due, each with the server's answer; waits for each answer."""
         assert ablation is None, "a served policy sees what there is"
         for robot in active:
-            # Only where a question follows: the server counts ticks between questions with frames.
+            # Only if a question follows: the server counts ticks between questions with frames.
             if robot.loop.frames_due and robot.loop.chunk_due:
                 self._photograph(robot)
         asking = [robot for robot in active if robot.sees and robot.loop.chunk_due]

@@ -1,7 +1,7 @@
-"""What rollouts gave: episodes of the simulated insertion, success rates and tables.
+"""The results of rollouts: episodes of the simulated insertion, success rates and tables.
 
-Success, its limits and reasons are the environment's (`pipeline.simulation.insertion`); rates have
-Wilson intervals.
+The environment (`pipeline.simulation.insertion`) defines success, its limits and the reasons of
+failure. Rates have Wilson intervals.
 """
 
 from collections import Counter
@@ -22,12 +22,12 @@ EXPERT: Final = "expert"
 
 
 def late_name(latency_ms: float) -> str:
-    """The controller that is the policy with a model so late."""
+    """The name of the policy as a controller, when its model has this latency."""
     return f"{latency_ms:g} ms late"
 
 
 def controller_name(controller: str) -> str:
-    """What people read of a controller."""
+    """The name of a controller in reports."""
     known = {POLICY: "policy", EXPERT: "demonstrator"}
     return known.get(controller, f"policy, {controller}")
 
@@ -36,9 +36,9 @@ def controller_name(controller: str) -> str:
 class RolloutEpisode:
     """One episode, and how it ended.
 
-    `lateral_mm` sideways from the target where the tissue was punctured, else at the end;
-    `depth_mm` from the tip to the layer at the end, positive short of it; `overshoot_mm` the
-    farthest beyond it.
+    `lateral_mm` is the distance sideways from the target where the tissue was punctured, else at
+    the end. `depth_mm` is the distance from the tip to the layer at the end, positive if the tip is
+    short of it. `overshoot_mm` is the greatest distance beyond the layer.
     """
 
     controller: str
@@ -55,7 +55,7 @@ class RolloutEpisode:
     ticks: int
     trace: InsertionTrace
     frames: Callable[[float], Mapping[str, NDArray[np.uint8]]]
-    """What the cameras saw at a time in s: RGB (126, 224, 3) by view."""
+    """The camera frames at a time in s: RGB (126, 224, 3) by view."""
 
 
 @dataclass(frozen=True)
@@ -69,7 +69,7 @@ class SuccessRate:
 
     @classmethod
     def of(cls, successes: Sequence[bool]) -> "SuccessRate":
-        """That of episodes, at least one, by whether each succeeded."""
+        """The rate of one or more episodes, from whether each succeeded."""
         count, episodes = sum(successes), len(successes)
         interval = binomtest(count, episodes).proportion_ci(method="wilson")
         return cls(count / episodes, float(interval.low), float(interval.high), episodes)
@@ -88,12 +88,12 @@ class Rollouts:
 
     @property
     def level(self) -> str:
-        """That of all episodes."""
+        """The level of all episodes."""
         return self.episodes[0].level
 
     @property
     def controllers(self) -> tuple[str, ...]:
-        """Who controlled them, the policy first."""
+        """The controllers of the episodes, the policy first."""
         return tuple(dict.fromkeys(episode.controller for episode in self.episodes))
 
     def of(self, controller: str) -> tuple[RolloutEpisode, ...]:
@@ -107,13 +107,13 @@ class Rollouts:
         }
 
     def by_latency(self) -> dict[float, SuccessRate]:
-        """The policy's success by what a pass of the model takes, ms, in rising order."""
+        """The policy's success by the latency of the model in ms, in rising order."""
         rates, (first, *others) = self.rates(), latencies_ms(self.settings["latency_ms"])
         names = {first: POLICY} | {latency_ms: late_name(latency_ms) for latency_ms in others}
         return {latency_ms: rates[names[latency_ms]] for latency_ms in sorted(names)}
 
     def summary(self) -> Table:
-        """A row a controller: its success, and where its episodes ended."""
+        """A row for each controller: its success, and where and why its episodes ended."""
         rows: list[tuple[Any, ...]] = []
         for name, rate in self.rates().items():
             episodes = self.of(name)
@@ -136,7 +136,7 @@ class Rollouts:
         return {"success": success, "levels": {self.level: success}, "latency_ms": late}
 
     def table(self, policy: bool) -> Table:
-        """A row an episode: those of the policy, or those beside it with who controlled them."""
+        """A row for each episode: of the policy, or of the others with their controller."""
         heads = _COLUMNS if policy else ("controller", *_COLUMNS)
         episodes = [e for e in self.episodes if (e.controller == POLICY) == policy]
         return Table(heads, [tuple(getattr(e, name) for name in heads) for e in episodes])

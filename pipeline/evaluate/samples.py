@@ -43,7 +43,7 @@ class SampledChunks:
         """The mean and the best of the samples, (tick, horizon, action_dim); empty with one sample.
 
         The best has the lowest error over the valid entries. Only the recorded actions tell which
-        it is, so it shows what is among the samples, not what a robot would do.
+        one it is, so it shows what the samples contain, not what a robot would do.
         """
         ways = {MEAN: self._mean, BEST: self._best}
         return {name: np.concatenate(parts) for name, parts in ways.items() if parts}
@@ -52,7 +52,7 @@ class SampledChunks:
         """The energy score of each tick's samples; empty with one sample.
 
         Gneiting and Raftery (2007), eq. 21 with beta 1, negated so that lower is better: the mean
-        distance to what was recorded, less half the mean distance between two different samples.
+        distance to the recorded chunk, minus half the mean distance between two different samples.
         A distance is Euclidean over the valid entries of the chunk in training std, divided by the
         square root of their number: for a single sample, its root mean square error.
         """

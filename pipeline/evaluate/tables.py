@@ -58,14 +58,14 @@ HEADINGS = {method: method.removesuffix("_action").replace("_", " ") for method 
 def scopes(comparison: Comparison) -> dict[str, Comparison]:
     """The comparison over the executed steps and over the whole chunk.
 
-    Where several steps are executed, that over the first alone stands between them.
+    If several steps are executed, the comparison over the first step alone is between them.
     """
     first = {"first_step": comparison.part(steps=slice(1))} if comparison.execute > 1 else {}
     return {"executed": comparison.executed, **first, "chunk": comparison}
 
 
 def titles(comparison: Comparison) -> tuple[str, str]:
-    """The executed steps and the whole chunk in words, with whether figures have intervals."""
+    """Titles for the executed steps and for the whole chunk; they name intervals or their lack."""
     horizon = comparison.cells.entries.shape[1]
     steps = "step 0" if comparison.execute == 1 else f"the first {comparison.execute} steps"
     ends = "with 95 % intervals" if _has_intervals(comparison) else "without intervals"
@@ -129,7 +129,7 @@ def _plain(figure: Figure) -> dict[str, float]:
 
 
 def sample_figures(comparison: Comparison, energy: Figure | None) -> dict[str, Figure]:
-    """The errors of several samples beside one, over the whole chunk; empty with one sample."""
+    """The errors of one and of several samples, over the whole chunk; empty with one sample."""
     if MEAN not in comparison.scores or energy is None:
         return {}
     names = {"one": "policy", MEAN: MEAN, BEST: BEST}
@@ -142,7 +142,7 @@ def by_phase(comparison: Comparison) -> dict[str, Comparison]:
 
 
 def error_table(comparison: Comparison) -> Table:
-    """Mean absolute errors with their intervals, a row a method."""
+    """Mean absolute errors with their intervals, a row for each method."""
     groups = (*comparison.groups, None)
     rows = [
         [HEADINGS[way], *(error(comparison, way, group).text() for group in groups)]
@@ -212,7 +212,7 @@ def verdicts(comparison: Comparison) -> str:
 
 
 def samples_text(comparison: Comparison, energy: Figure | None) -> str:
-    """A line on the errors of several samples beside one."""
+    """A line on the errors of one and of several samples."""
     sampled = sample_figures(comparison, energy)
     if not sampled:
         return "the expert gives one chunk a tick: nothing to say of several samples"
@@ -272,9 +272,9 @@ def evaluated_on(study: AblationStudy) -> str:
 
 
 def write_tables(folder: Path, evaluation: Evaluation) -> list[Path]:
-    """Write metrics.json, its headline and one CSV each of all errors: see docs/reports.md.
+    """Write metrics.json, its headline and the CSV files of all errors; see docs/reports.md.
 
-    Without a `study`, modalities.csv and streams.csv have headings alone: `dvc plots` needs the
+    Without a `study`, modalities.csv and streams.csv have only headings: `dvc plots` needs the
     files, and those of an earlier evaluation must not stay.
     """
     comparison, store, study = evaluation.comparison, evaluation.store, evaluation.study
@@ -330,7 +330,7 @@ def _recording_groups(comparison: Comparison) -> Table:
 
 
 def _dimensions(comparison: Comparison) -> Table:
-    """Over the whole chunk."""
+    """The errors of each dimension over the whole chunk."""
     return Table.of(
         {"dimension": name, "unit": unit} | _errors(comparison, ActionGroup(name, unit, (index,)))
         for index, (name, unit) in enumerate(zip(comparison.names, comparison.units, strict=True))

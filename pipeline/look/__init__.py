@@ -1,5 +1,5 @@
-"""Pages for people who would rather look: recordings, a store, an evaluation, rollouts; doctor.
+"""Pages to look at recordings, a store, an evaluation or rollouts; and the doctor.
 
-A file a topic has its facts, pictures and sections together; recordings, which have most, are a
-folder of such files. `page` writes them.
+Each topic has a file with its facts, pictures and sections. Recordings, the largest topic, are a
+folder of such files. `page` writes the pages.
 """

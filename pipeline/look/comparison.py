@@ -57,7 +57,7 @@ def comparison_report(experiments: Sequence[Experiment]) -> Report:
 
 
 def draw_experiments(experiments: Sequence[Experiment]) -> Figure:
-    """Errors of what is executed and of the whole chunk, with intervals, seeds and baselines."""
+    """Errors of the executed steps and of the whole chunk, with intervals, seeds and baselines."""
     figure, axes = panels(11.0, 0.36 * len(experiments) + 2.8, 1, len(SPANS), sharey=True)
     for axis, (span, words) in zip(axes, SPANS.items(), strict=True):
         for place, experiment in enumerate(experiments):

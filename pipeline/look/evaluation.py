@@ -46,7 +46,7 @@ LABELS = {way: f"baseline: {words}" for way, words in tables.HEADINGS.items()} |
 """Legend entry of each method."""
 STYLES: dict[str, dict[str, Any]] = {
     "policy": {"color": "#0072B2", "marker": "o", "ls": "-", "zorder": 5, "lw": 2.4, "ms": 6.5},
-    # An open, larger square stays visible where the median action is next to no motion.
+    # An open, larger square stays visible when the median action is almost no motion.
     "zero_action": {"color": "#E69F00", "marker": "s", "ls": "--", "fillstyle": "none", "ms": 8.5},
     "median_action": {"color": "#009E73", "marker": "^", "ls": "-."},
     "repeat_last": {"color": "#CC79A7", "marker": "D", "ls": ":"},
@@ -58,7 +58,7 @@ _CHUNKS_WIDTH = 11.0
 _CHUNK = PALETTE[5]
 """Colour of whole chunks."""
 _NUMBERED_STEPS = 16
-"""Steps of a chunk up to which a cell has room for its number."""
+"""The most steps of a chunk with which a cell has room for its number."""
 _POLICY = STYLES["policy"]["color"]
 _CURVES = {
     "train/loss": ("training loss", PALETTE[0]),
@@ -69,7 +69,7 @@ _CURVES = {
 _INSTANTS = 5
 """Ticks of an episode at which its frames are shown."""
 _EPISODES = 40
-"""Rows of the table of episodes."""
+"""The most rows of the table of episodes."""
 _PAIRED = (
     "Policy minus best baseline in each figure, by the paired bootstrap over groups of test "
     "recordings: not resolved is a difference whose 95 % interval holds 0."
@@ -77,9 +77,9 @@ _PAIRED = (
 
 
 def evaluation_report(evaluation: Evaluation, rollout: str = "") -> Report:
-    """The page of an evaluation, with frames of its recordings where they still lie.
+    """The page of an evaluation, with frames of its recordings if these are still there.
 
-    `rollout` is the page of the closed loop, relative to this one, if there is one. The same
+    `rollout` is the path from this page to the page of the rollouts, if there is one. The same
     evaluation gives the same page: it names neither the time nor its own folder.
     """
     comparison, policy = evaluation.comparison, evaluation.judged["policy"]
@@ -157,7 +157,7 @@ def draw_methods(comparison: Comparison) -> Figure:
 
 
 def draw_bar(axis: Axes, place: int, merit: Merit, height: float, **style: Any) -> None:
-    """A bar to the right, and its interval where it has one."""
+    """Draw a bar to the right, and its interval if it has one."""
     axis.barh(place, merit.value, height, **style)
     if merit.low is not None and merit.high is not None:
         axis.plot([merit.low, merit.high], [place, place], color=INK, lw=1.6, marker="|")
@@ -179,7 +179,7 @@ def _phases(comparison: Comparison) -> list[Block]:
 
 
 def _dimensions(evaluation: Evaluation) -> list[Block]:
-    """Over the whole chunk."""
+    """Errors over the whole chunk, by dimension and by step."""
     comparison = evaluation.comparison
     columns = ["dimension", "unit", *(tables.HEADINGS[method] for method in METHODS)]
     errors = [comparison.scores[method].mae for method in METHODS]
@@ -200,7 +200,7 @@ def _dimensions(evaluation: Evaluation) -> list[Block]:
 
 
 def draw_scatter(comparison: Comparison, predictions: Predictions) -> Figure:
-    """Predicted against recorded next action, a panel a dimension; on the diagonal it is right."""
+    """Predicted against recorded next action, a panel for each dimension; the diagonal is right."""
     shown = comparison.varying()
     columns = min(4, len(shown))
     lines = math.ceil(len(shown) / columns)
@@ -228,7 +228,7 @@ def draw_scatter(comparison: Comparison, predictions: Predictions) -> Figure:
 
 
 def draw_horizon(comparison: Comparison, action_hz: float | None) -> Figure:
-    """Mean absolute error by how far ahead an action lies, a panel an action group."""
+    """Mean absolute error by steps ahead, with a panel for each action group."""
     ahead = "steps ahead" if action_hz is None else f"steps ahead [{1000 / action_hz:.0f} ms each]"
     groups = comparison.varying_groups()
     figure, (axes,) = panels(max(4.6 * len(groups), 9.4), 4.4, 1, len(groups), squeeze=False)
@@ -248,7 +248,7 @@ def draw_horizon(comparison: Comparison, action_hz: float | None) -> Figure:
 
 
 def _draw_band(axis: Axes, comparison: Comparison, method: str, group: ActionGroup) -> None:
-    """The 95 % interval of a group's error at each step."""
+    """Draw the 95 % interval of a group's error at each step."""
     steps = range(comparison.cells.entries.shape[1])
     parts = (comparison.part(steps=slice(step, step + 1)) for step in steps)
     errors = [error(part, method, group) for part in parts]
@@ -290,9 +290,9 @@ def _episodes(evaluation: Evaluation) -> list[Block]:
 
 
 def _extremes(evaluation: Evaluation) -> Iterator[Section]:
-    """The best and the worst episode closely, with frames where their recordings still lie.
+    """The best and the worst episode in detail, with frames if their recordings are still there.
 
-    The picture of a single episode is named as that of the worst, which dvc.yaml lists.
+    A single episode's picture has the name of the worst one's, because dvc.yaml lists that.
     """
     comparison, predictions, store = evaluation.comparison, evaluation.predictions, evaluation.store
     digest_of = cache(file_digest)  # episodes of a LeRobot data set share files
@@ -331,8 +331,9 @@ def draw_chunks(
 ) -> Figure:
     """Frames at `instants` above, and below them recorded and predicted actions over time.
 
-    `instants` are test ticks of the episode, store-global; `frames` has one a view for each, or
-    no view at all. Drawn are the next action at every tick, and the whole chunk at the instants.
+    `instants` are test ticks of the episode, store-global; `frames` has one of each view for each
+    instant, or no view at all. The picture shows the next action at every tick, and the whole chunk
+    at the instants.
     """
     time_s = store.array("tick/time")[episode.ticks.start : episode.ticks.stop]
     time_s = time_s - time_s[0]
@@ -421,7 +422,7 @@ def draw_curves(logged: TrainingCurves, step: int) -> Figure:
         curve, (title, colour) = logged.curves[name], _CURVES.get(name, (name, PALETTE[4]))
         marker = "o" if len(curve.step) <= 30 else ""
         axis.plot(curve.step, curve.value, color=colour, marker=marker, markersize=4)
-        # Within a decade a logarithmic axis has odd numbers only.
+        # Within one decade, the labels of a logarithmic axis would be odd numbers.
         if 0 < 10 * curve.value.min() <= curve.value.max():
             logarithmic(axis)
         else:

@@ -1,4 +1,4 @@
-"""The picture of a probe: where in the model, and where in the image, the action is."""
+"""The picture of a probe: which layers and which cells of the image predict the action."""
 
 from collections import defaultdict
 from collections.abc import Sequence
@@ -12,15 +12,15 @@ from pipeline.evaluate.probe.study import ProbeResult, ProbeStudy
 from pipeline.look.page.style import canvas, draw_map
 
 _MAPS = 6
-"""Most maps of the cells of a view; the layers of a model look alike."""
+"""The most maps of the cells of a view; the layers of a model look alike."""
 _MAPS_A_ROW = 3
 
 
 def draw_gains(study: ProbeStudy) -> Figure:
     """The gain of every slot over the baseline without features.
 
-    Above, layers by pooling; below, the best maps of a view's cells. All share one scale of
-    colours, from at most 1 below the best value shown up to it.
+    The upper part shows layers by pooling, the lower part the best maps of a view's cells. All
+    share one colour scale, from at most 1 below the best shown value up to this value.
     """
     plain = [result for result in study.slots if result.name.cell is None]
     poolings = list({result.name.pooling: None for result in study.groups})

@@ -1,4 +1,4 @@
-"""A recorded run of a robot beside its store: whether it has the features the robot acted on."""
+"""A robot's recorded run compared with its store: does the store have the robot's features?"""
 
 from pathlib import Path
 
@@ -15,15 +15,15 @@ from pipeline.store import FeatureStore
 
 
 def compare_keys(recording: str | Path, store: FeatureStore) -> str:
-    """How many VL rows of a run's store have a key of the robot's, and which have none.
+    """How many VL rows of a run's store have a key that the robot used, and which have none.
 
-    Rows without are counted from 0, with their times since the run's first row. Where the feature
-    specs of policy and store differ, the text names the differences instead.
+    Rows without one are named by their number, from 0, and their time since the run's first row. If
+    the feature specs of policy and store differ, the text names the differences instead.
 
-    A key is a digest of feature spec, prompt and pixels: where the robot acted on the row's key,
-    the store has that very feature. A key may be missing because the model had no time for those
-    frames. Raises `StoreMismatch` where the store does not have exactly one episode at the
-    recording's path, `RecordingError` where it is no run.
+    A key is a digest of feature spec, prompt and pixels: if the robot used the row's key, it acted
+    on the same features that the store has. A key may be missing because the model had no time for
+    those frames. Raises `StoreMismatch` unless the store has exactly one episode at the recording's
+    path, and `RecordingError` if the recording is not a run.
     """
     root = Path(recording).resolve()
     path = sidecar(root, "features")

@@ -38,19 +38,19 @@ _CONTROLLERS = (
 )
 _MOMENTS = 8
 _NEAR_MM = 3.0
-"""Reach of the nearer picture of the paths, from the target."""
+"""How far from the target the close picture of the paths reaches."""
 _REACH = 1.3
-"""Reach of the whole picture, as a multiple of how far from the target episodes begin."""
+"""Reach of the whole picture, as a multiple of the greatest distance at which episodes begin."""
 _WIDTH = 9.0
 _OTHER = "#999999"
 """Colour of an episode among many."""
 _OUTCOMES = {True: ("inserted", PALETTE[0], "o"), False: ("not inserted", PALETTE[5], "X")}
 _MANY = 100
-"""Episodes from which paths are pixels in the page: thousands of lines are slow."""
+"""With more episodes than this, the page has the paths as pixels: thousands of lines are slow."""
 
 
 def rollout_report(rollouts: Rollouts) -> Report:
-    """The page of these rollouts, those of `policy` in detail.
+    """The page of these rollouts; it shows those of `policy` in detail.
 
     The same rollouts give the same page: it names neither the time nor its own folder. Pictures ask
     the episodes for their frames when they are drawn.
@@ -75,7 +75,7 @@ def rollout_report(rollouts: Rollouts) -> Report:
 
 
 def _lateness(rollouts: Rollouts) -> Iterator[Section]:
-    """Success against latency, where there are several."""
+    """Success against latency, if there are several latencies."""
     rates = rollouts.by_latency()
     if len(rates) > 1:
         words = "The same episodes with a model that takes longer for a pass. Bars are 95 %."
@@ -84,7 +84,7 @@ def _lateness(rollouts: Rollouts) -> Iterator[Section]:
 
 
 def draw_latency(rates: Mapping[float, SuccessRate]) -> Figure:
-    """The success of the policy against what a pass of the model takes."""
+    """The success of the policy against the duration of a model pass."""
     figure, axis = panels(_WIDTH, 3.6, 1, 1)
     centre, low, high = 100 * np.array([(r.rate, r.low, r.high) for r in rates.values()]).T
     bars = np.stack([centre - low, high - centre])
@@ -94,10 +94,10 @@ def draw_latency(rates: Mapping[float, SuccessRate]) -> Figure:
 
 
 def worst_and_median(episodes: Sequence[RolloutEpisode]) -> tuple[RolloutEpisode, RolloutEpisode]:
-    """The worst episode, and the one in the middle between it and the best.
+    """The worst episode, and the one halfway between it and the best.
 
-    Episodes without success are worse than those with; among equals, the farther the tip was from
-    the target and from the layer (mm, added), the worse.
+    Failures are worse than successes. Among equals, the greater the sum of the tip's distances from
+    the target and from the layer (mm), the worse.
     """
     ordered = sorted(
         episodes, key=lambda episode: (episode.success, -episode.lateral_mm - abs(episode.depth_mm))
@@ -131,7 +131,7 @@ def _paths_and_courses(rollouts: Rollouts) -> list[Block]:
 
 
 def draw_paths(rollouts: Rollouts) -> Figure:
-    """The tip's paths from above, of policy and demonstrator; below, close to the target."""
+    """The tip's paths of policy and demonstrator, seen from above; the lower row is close up."""
     shown = [name for name in ("policy", "expert") if rollouts.of(name)]
     begins = [episode.trace.offset_mm[:1] for name in shown for episode in rollouts.of(name)]
     far = max(_NEAR_MM, _REACH * float(np.abs(np.concatenate(begins)).max()))
@@ -147,7 +147,7 @@ def draw_paths(rollouts: Rollouts) -> Figure:
 
 
 def _draw_all(axis: Axes, episodes: Sequence[RolloutEpisode], reach_mm: float) -> None:
-    """The path of each episode, from where it last comes within reach."""
+    """Draw the path of each episode from where it last comes within reach."""
     for episode in episodes:
         offset_mm = episode.trace.offset_mm
         (outside,) = np.nonzero(np.abs(offset_mm).max(axis=1) > reach_mm)
@@ -168,9 +168,9 @@ def _draw_all(axis: Axes, episodes: Sequence[RolloutEpisode], reach_mm: float) -
 def draw_courses(
     episodes: Sequence[RolloutEpisode], strong: Mapping[str, RolloutEpisode]
 ) -> Figure:
-    """Place and force over time, a thin line an episode.
+    """Place and force over time, with a thin line for each episode.
 
-    `strong` are those that stand out, by their legend entry.
+    `strong` are the episodes with a thick line, by their legend entry.
     """
     figure, axes = panels(_WIDTH, 10.0, 4)
     pixels = len(episodes) > _MANY
@@ -187,7 +187,7 @@ def draw_courses(
 
 
 def _draw_course(axes: Sequence[Axes], episode: RolloutEpisode, **style: Any) -> None:
-    """From top to bottom: sideways from the target, height, distance to the layer, force."""
+    """Draw, from top to bottom: distance sideways, height, distance to the layer, force."""
     trace = episode.trace
     shown = (np.hypot(*trace.offset_mm.T), trace.height_mm, trace.layer_mm, trace.force_n)
     for axis, values in zip(axes, shown, strict=True):
@@ -195,7 +195,7 @@ def _draw_course(axes: Sequence[Axes], episode: RolloutEpisode, **style: Any) ->
 
 
 def _mark_limits(axes: Sequence[Axes]) -> None:
-    """Titles, and the limits that an episode must keep."""
+    """Draw titles, and the limits that an episode must keep."""
     sideways, height, layer, force = axes
     for axis, limit in zip(axes, (MISS_MM, 0, -OVERSHOOT_MM, FORCE_LIMIT_N), strict=True):
         axis.axhline(limit, color=INK, lw=1, ls="--")

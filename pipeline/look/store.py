@@ -1,8 +1,8 @@
 """A store's page: coverage, reuse and health of its features, and what it was made of.
 
-Recordings have a page of their own; here is what only a store has. A store is only read, in bounded
-memory: whole only what is a few bytes a tick or VL row, of features one slot of `inspect.points` VL
-rows at a time.
+Recordings have a page of their own; this page shows what only a store has. The store is never
+changed, and little memory is used: only arrays of a few bytes for each tick or VL row are read
+whole; of the features, one slot of `inspect.points` VL rows is read at a time.
 """
 
 import re
@@ -38,20 +38,20 @@ from pipeline.vlm.slots import slot_name
 
 NOTHING = "Nothing looks wrong: every check passed."
 EPISODES = 100
-"""Episodes in the table of all; of more, the first."""
+"""The most episodes in the table; if there are more, it has the first."""
 DEAD = 1e-3
-"""Spread of a slot's numbers, as a share of their size, below which it tells nothing."""
+"""A slot is dead if the spread of its numbers is below this share of their size."""
 _STILL_ROWS = 3
-"""VL rows of an episode from which its features can be still."""
+"""An episode needs so many VL rows for its features to count as still."""
 _STALE_PERIODS = 2
-"""Times the period of VL rows from which features are old."""
+"""Features are old beyond this multiple of the period of VL rows."""
 _SAME_SHARE = 0.5
-"""Share of the rows of an episode, from which another with the same rows is the same recording."""
+"""Two episodes are the same recording if they share at least this share of their rows."""
 _BLOCK_BYTES = 2**24
 _TINY = 1e-30
 _NAMED_SLOTS = 20
 _LINE = "#222222"
-"""Between sources: a map is light on a dark page too, where ink is white."""
+"""Colour of lines between sources: a map is light on a dark page too, where ink is white."""
 _AROUND = LinearSegmentedColormap.from_list("around", ("#0072B2", "#f0f0f0", "#D55E00"))
 
 
@@ -75,14 +75,14 @@ class Coverage:
 
 @dataclass(frozen=True, eq=False)
 class FeatureHealth:
-    """Length and spread of the features of some VL rows, by slot; of variants, the plain frames."""
+    """Length and spread of the features of some VL rows, by slot; only of the plain frames."""
 
     rows: NDArray[np.int64]
     """(row,) ascending, in the store."""
     episode: NDArray[np.int64]
     """(row,) index of the episode."""
     names: tuple[str, ...]
-    """(slot,)"""
+    """(slot,) the names of the slots."""
     norm: NDArray[np.float32]
     """(row, slot) Euclidean; NaN where the slot is invalid or not finite."""
     variation: NDArray[np.float64]
@@ -95,7 +95,7 @@ class FeatureHealth:
 
 @dataclass(frozen=True, eq=False)
 class StoreView:
-    """A store and everything that its page says of it."""
+    """A store and everything that its page shows."""
 
     store: FeatureStore
     episodes: tuple[Coverage, ...]
@@ -105,13 +105,13 @@ class StoreView:
     """VL rows whose key another row has."""
     features: FeatureHealth
     bytes: int
-    """On the disk."""
+    """Size on the disk."""
     issues: tuple[Issue, ...]
-    """Those without an episode are of the whole store."""
+    """An issue without an episode is about the whole store."""
 
 
 def inspect_store(path: str | Path, params: InspectParams) -> StoreView:
-    """Everything that the page says of a finished store.
+    """Everything that the page shows of a finished store.
 
     Checks the checksums of metadata, of every narrow array and of the `params.points` VL rows that
     are looked at; stages.verify checks the rest. Raises `StoreIncomplete` where the store is not
@@ -203,7 +203,7 @@ def read_coverage(store: FeatureStore, episode: Episode) -> Coverage:
 
 
 def _source_table(episodes: Sequence[Coverage]) -> Table:
-    """A row a source."""
+    """A row for each source."""
     parts: dict[str, list[Coverage]] = defaultdict(list)
     for part in episodes:
         parts[part.episode.source].append(part)
@@ -221,7 +221,7 @@ def _source_table(episodes: Sequence[Coverage]) -> Table:
 
 
 def _episode_table(episodes: Sequence[Coverage]) -> Table:
-    """A row an episode."""
+    """A row for each episode."""
     caption = "Ticks see all streams and views, none of one (no …), or one in a share of them."
     if len(episodes) > EPISODES:
         caption += f" The first {EPISODES} of {len(episodes)} episodes."
@@ -257,7 +257,7 @@ def find_coverage_issues(episodes: Sequence[Coverage]) -> Iterator[Issue]:
 
 
 def read_ages(store: FeatureStore) -> dict[str, NDArray[np.float32]]:
-    """`newest frame` and each view -> (tick,) age in s: time of the tick less that of the frame."""
+    """`newest frame` and each view -> (tick,) age in s: the tick's time minus the frame's."""
     shown = store.array("vl/frame_time")[store.array("tick/vl_row")]
     ages = (store.array("tick/time")[:, None] - shown).astype(np.float32)
     newest = store.feature_age(np.arange(store.ticks)).astype(np.float32)
@@ -278,9 +278,9 @@ def find_age_issues(
 
 
 def find_shared_rows(store: FeatureStore, episodes: Sequence[Coverage]) -> tuple[int, list[Issue]]:
-    """How many VL rows have the key of another, and an issue for episodes with the same rows.
+    """How many VL rows share a key with another row, and an issue for episodes with the same rows.
 
-    Equal keys are equal frames, prompt and feature spec.
+    Equal keys mean equal frames, prompt and feature spec.
     """
     keys = np.ascontiguousarray(store.array("vl/key")).view(f"V{KEY_BYTES}").ravel()
     _, key, counts = np.unique(keys, return_inverse=True, return_counts=True)
@@ -302,7 +302,7 @@ def find_shared_rows(store: FeatureStore, episodes: Sequence[Coverage]) -> tuple
 
 
 def _reuse_blocks(view: StoreView, total: int) -> list[Block]:
-    """Ages of the features, and how many rows are there twice."""
+    """Ages of the features, and how many rows occur twice."""
     rows = [
         (name, *np.nanquantile(age, (0.01, 0.5, 0.99, 1.0)).tolist())
         for name, age in view.ages.items()
@@ -321,7 +321,7 @@ def _reuse_blocks(view: StoreView, total: int) -> list[Block]:
 
 
 def _check_rows(store: FeatureStore, rows: NDArray[np.int64]) -> None:
-    """Raise `StoreIncomplete` where one of these VL rows does not give its checksum."""
+    """Raise `StoreIncomplete` if one of these VL rows does not have its checksum."""
     features, checksums = store.array(FEATURES), store.array("vl/checksum")
     spec = read_spec(store.path, FEATURES)
     for block in np.array_split(rows, max(1, len(rows) * features[:1].nbytes // _BLOCK_BYTES)):
@@ -356,7 +356,7 @@ def read_slot(store: FeatureStore, rows: NDArray[np.int64], slot: int) -> NDArra
 
 
 def _variation(values: NDArray[np.float32]) -> float:
-    """The median over numbers of spread / size: huge constant numbers do not hide the others."""
+    """The median over numbers of spread / size, so huge constant numbers do not hide the others."""
     if len(values) < 2:
         return np.nan
     spread = values.std(axis=0, dtype=np.float64)
@@ -384,7 +384,7 @@ def find_feature_issues(health: FeatureHealth, episodes: Sequence[Coverage]) -> 
 
 
 def _feature_blocks(view: StoreView, total: int) -> list[Block]:
-    """Which rows were looked at, and the picture of their norms."""
+    """Which rows were read, and the picture of their norms."""
     health = view.features
     words = "Looked at: all VL rows"
     if len(health.rows) < total:
@@ -410,7 +410,7 @@ def draw_norms(health: FeatureHealth, episodes: Sequence[Coverage]) -> Figure:
     left.plot(middle, at, "o", color=PALETTE[0], ms=min(5.0, 120 / slots), label="median")
     left.set_xlabel("norm of the features")
     left.set_ylim(slots - 0.5, -0.5)
-    # Of many slots, the first of those that differ in their cell only.
+    # With many slots, only the first of those that differ just in their cell is named.
     stems = (
         health.names
         if slots <= _NAMED_SLOTS
@@ -441,7 +441,7 @@ def _quantiles(norm: NDArray[np.float32], shares: Sequence[float]) -> NDArray[np
 
 
 def _mark_sources(axis: Axes, sources: Sequence[str]) -> None:
-    """Sources and how many episodes they have below an axis of episodes, parted by lines."""
+    """Draw sources and their numbers of episodes below an axis of episodes, with lines between."""
     starts = [at for at, source in enumerate(sources) if not at or source != sources[at - 1]]
     for start in starts[1:]:
         axis.axvline(start - 0.5, color=_LINE, lw=1.0)

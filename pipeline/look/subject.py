@@ -22,8 +22,8 @@ STORE = (".zarr", ".zarr.part")
 class Subject:
     """What is inspected: recordings, or a store.
 
-    `name` is the user's, `folder` the place of the page; `store` is None for recordings, whose
-    relative paths begin at `root`.
+    `name` is the user's name for it, `folder` the place of the page. `store` is None for
+    recordings; their relative paths begin at `root`.
     """
 
     name: str
@@ -73,7 +73,7 @@ def subject_of(params: Params) -> Subject:
             f"inspect.path: {stores[0]} is a store, and {len(matches) - 1} more paths are named. "
             f"Look at it alone: {command('inspect', quote(str(stores[0])))}"
         )
-    # The last part of the first path that is no pattern.
+    # The last part of the first path that is not a pattern.
     parts = [part for part in Path(places[0]).absolute().parts if not glob.has_magic(part)]
     name = parts[-1].strip("/") or "recordings"
     source = Source(name=name, path=tuple(places), format=wanted.format)
@@ -81,7 +81,7 @@ def subject_of(params: Params) -> Subject:
 
 
 def _check_output(folder: Path) -> None:
-    """Raise `ConfigError` before anything is read, where the page could not be written."""
+    """Raise `ConfigError` before anything is read, if the page could not be written."""
     places = [folder.absolute(), *folder.absolute().parents]
     there = next(place for place in places if place.exists())
     wrong = "" if os.access(there, os.W_OK | os.X_OK) else f"{there} cannot be written to"
@@ -92,14 +92,14 @@ def _check_output(folder: Path) -> None:
 
 
 def _is_store(path: Path) -> bool:
-    """Whether it is a store by its content, or by its name and not of zarr v2, which none is."""
+    """Whether it is a store, by its content or by its name; a zarr v2 group is never one."""
     if (path / "zarr.json").is_file():
         return True
     return path.is_dir() and path.name.endswith(STORE) and not (path / ".zgroup").exists()
 
 
 def _folder(wanted: InspectParams, places: Sequence[str]) -> Path:
-    """The output where it was set, else a folder in it named after the first path."""
+    """The output if it was set, else a folder in it named after the first path."""
     if "output" in wanted.model_fields_set or not places:
         return wanted.output
     first = os.path.relpath(places[0])

@@ -18,14 +18,14 @@ TOKEN_VARIABLE: Final = "VLA_SERVE_TOKEN"
 
 
 class PolicyClient(AbstractContextManager["PolicyClient"]):
-    """One robot's connection to a policy server, which has one memory for it.
+    """One robot's connection to a policy server, which keeps a memory of this robot.
 
     Close it, or use it in a `with` statement. Raises `ServerError`, and `ObservationError` where
     the server refuses an observation.
     """
 
     metadata: Mapping[str, Any]
-    """Of the policy: streams with names and units, rates, horizon, feature spec."""
+    """The policy's metadata: streams with names and units, rates, horizon, feature spec."""
 
     def __init__(
         self,
@@ -51,7 +51,7 @@ class PolicyClient(AbstractContextManager["PolicyClient"]):
         self.reconnect()
 
     def reconnect(self) -> None:
-        """Connect again and begin a new episode: the server's memory of the last is gone."""
+        """Connect again and begin a new episode: the server has lost its memory of the last one."""
         self.close()
         self._connection = self._connected()
         try:
@@ -73,7 +73,7 @@ class PolicyClient(AbstractContextManager["PolicyClient"]):
         try:
             answer = wire.unpack(self._receive(message))
         except ServerBusy:
-            self._reset = None  # The server has taken it with the readings.
+            self._reset = None  # The server has taken the reset with the readings.
             raise
         self._reset = None
         if "feature_key" in answer:
@@ -122,7 +122,7 @@ class PolicyClient(AbstractContextManager["PolicyClient"]):
                 self._connection.send(message)
             answer = self._connection.recv(self._timeout_s)
         except TimeoutError:
-            self.close()  # A late answer would be taken for the next one.
+            self.close()  # A late answer would be mistaken for the next one.
             raise ServerError(
                 f"{self._url}: expected an answer within {self._timeout_s:g} s, found none, and "
                 "left. Stop the robot; then reconnect, with a longer timeout_s if the model is slow"
@@ -147,7 +147,7 @@ class PolicyClient(AbstractContextManager["PolicyClient"]):
 
 
 def refuse_other_robot(robot: Mapping[str, Any], metadata: Mapping[str, Any]) -> None:
-    """Raise `CheckpointMismatch` where a policy was trained on another robot than this.
+    """Raise `CheckpointMismatch` if the policy was trained on a robot other than this one.
 
     Only the entries of the description are compared; the robot may have further views.
     """

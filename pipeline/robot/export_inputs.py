@@ -21,7 +21,7 @@ ROWS = 16
 _OLD_S = 30.0
 """Age of the oldest features among the random inputs."""
 _TURN = {"deg": 5.0, "rad": 0.1, "rotation": 5.0}
-"""How far the random inputs turn what is an angle, in its own unit."""
+"""Standard deviation of the random angles, by kind, in the kind's unit."""
 
 
 def golden_inputs(checkpoint: PolicyCheckpoint, policy: Policy) -> dict[str, Inputs]:
@@ -37,10 +37,10 @@ def golden_inputs(checkpoint: PolicyCheckpoint, policy: Policy) -> dict[str, Inp
 
 
 def random_inputs(checkpoint: PolicyCheckpoint, policy: Policy, rows: int, seed: int = 0) -> Inputs:
-    """Random observations about the training mean, on the CPU, and the noise for them.
+    """Random observations around the training mean, on the CPU, and the noise for them.
 
-    Windows are full, half full, of one reading or missing; features are old, slots and views are
-    missing.
+    Some windows are full, others half full, of one reading or empty; some features are old, some
+    slots and views are missing.
     """
     rng = np.random.default_rng(seed)
     given: dict[str, NDArray[Any]] = {}
@@ -69,17 +69,17 @@ def random_inputs(checkpoint: PolicyCheckpoint, policy: Policy, rows: int, seed:
 
 
 def count_draws(policy: Policy, given: Inputs) -> int:
-    """How often the policy draws noise in one act."""
-    asked: list[Tensor] = []
+    """How often the policy draws noise in one call of `act`."""
+    draws: list[Tensor] = []
     rows = len(next(iter(given.values())))
 
     def source() -> Iterator[Tensor]:
         while True:
-            asked.append(torch.zeros(rows, *chunk_size(policy)))
-            yield asked[-1]
+            draws.append(torch.zeros(rows, *chunk_size(policy)))
+            yield draws[-1]
 
     policy.act(cast(Observation, SimpleNamespace(**given)), source())
-    return len(asked)
+    return len(draws)
 
 
 def chunk_size(built: PolicyCheckpoint | Policy) -> tuple[int, int]:
@@ -90,7 +90,7 @@ def chunk_size(built: PolicyCheckpoint | Policy) -> tuple[int, int]:
 def _drawn(
     checkpoint: PolicyCheckpoint, stream: str, rows: int, rng: np.random.Generator
 ) -> NDArray[np.float64]:
-    """Random values (row, slot or reading, channel) of a stream about its training mean."""
+    """Random values (row, slot or reading, channel) of a stream around its training mean."""
     statistics, shape = getattr(checkpoint.normalization, stream), checkpoint.shape
     lengths = {"sensor": checkpoint.params.sensor_window, "state": checkpoint.params.state_readings}
     spread = statistics.std

@@ -1,9 +1,9 @@
-"""The first look at a robot: do its frames and states read as training's did?
+"""The first look at a robot: do its frames and states mean the same as in training?
 
-Golden rows cannot see what a robot's own code does: two cameras plugged the other way round, red
-and blue exchanged, joints in another order or unit. Such a wrong reading is refused only where it
-explains what came clearly better than the right one does, and where the training data tell the two
-apart. Everything else that is unusual passes.
+Golden rows cannot show errors of the robot's own code: two cameras swapped, red and blue exchanged,
+joints in another order or unit. Each error is tried as another reading of the data. The data are
+refused only if this wrong reading explains them clearly better than the right one does, and if the
+training data can tell the two apart. Everything else that is unusual passes.
 """
 
 import math
@@ -21,21 +21,22 @@ from pipeline.policy.checkpoint import PolicyCheckpoint
 from pipeline.policy.state_channels import expand
 
 Palette = NDArray[np.float64]
-"""Sorted grey levels of a frame: what it shows, wherever things stand."""
+"""Sorted grey levels of a frame; they do not depend on where things stand in it."""
 Frames = Mapping[str, NDArray[np.uint8]]
 
 _PIXELS = (64, 48)
 """Width and height that frames are shrunk to."""
 CLEARLY = 0.5
-"""A wrong reading is refused where it leaves less than this share of what the right one leaves
-unexplained; `python -m experiments.first_look` measures it."""
+"""Data are refused if the wrong reading's distance from training is less than this share of the
+right one's; `python -m experiments.first_look` measures it."""
 _LEAST = 2.0
-"""Grey levels between golden frames of two readings, below which they cannot be told apart."""
+"""Two readings whose golden frames differ by fewer grey levels cannot be told apart."""
 _ALIKE = 3.0
 """A wrong reading fits within this many times the distance between golden frames of one view."""
 _STRANGE, _UNIT_FITS, _ORDER_FITS = 10.0, 8.0, 4.0
-"""Training standard deviations: a state beyond the first is strange, one within the others fits in
-another unit or order. Right states of the demo reach 7.7; of orders there are many."""
+"""Training standard deviations: a channel beyond the first is strange; a state within the second
+fits in another unit, within the third in another order. Right states of the demo reach 7.7. The
+third is the strictest because there are many orders."""
 _UNITS = (
     ("deg", "radians", 180 / math.pi),
     ("rad", "degrees", math.pi / 180),
@@ -62,8 +63,8 @@ class FirstLook:
     def check(self, frames: Frames, state: NDArray[np.floating] | None = None) -> None:
         """Raise `ObservationError` where frames or states are read wrongly, and say how to mend it.
 
-        `frames` are RGB (height, width, 3) by view; of `state` (reading, channel) the last reading
-        counts. No frames, no state and no reading pass.
+        `frames` are RGB (height, width, 3) by view. Only the last reading of `state` (reading,
+        channel) is checked. Missing frames, a missing state and an empty state pass.
         """
         seen = {view: _shrink(frames[view]) for view in self._golden if view in frames}
         if shows := self._exchanged_views(seen):
@@ -82,7 +83,7 @@ class FirstLook:
             self._check_state(np.atleast_2d(state)[-1].astype(np.float64))
 
     def _exchanged_views(self, seen: Mapping[str, NDArray[np.float64]]) -> str:
-        """Which view shows which other, where each fits another's golden frames better."""
+        """Which view shows which other one, going by the golden frames; empty if none does."""
         light = {view: _light(pixels) for view, pixels in seen.items()}
         golden = {view: [_light(pixels) for pixels in self._golden[view]] for view in seen}
         views = list(seen)
@@ -95,8 +96,9 @@ class FirstLook:
     def _is_reversed(self, view: str, pixels: NDArray[np.float64]) -> bool:
         """Whether a frame's colours fit the golden ones better with red and blue exchanged.
 
-        By the colours as they are, which a lamp of another colour changes, and by the colours less
-        their median, which an object of another colour changes: both have to agree.
+        Two tests have to agree: one of the colours as they are, which a lamp of another colour
+        changes, and one of the colours minus their median, which an object of another colour
+        changes.
         """
         golden = self._golden[view]
         return all(
@@ -130,7 +132,7 @@ class FirstLook:
             )
 
     def _other_order(self, reading: NDArray[np.float64]) -> str:
-        """Which channel holds which other, where the values fit so; empty where they do not."""
+        """Which channel holds which other one, if the values fit in that order; else empty."""
         as_channel = self._deviations(np.repeat(reading[:, None], len(reading), axis=1))
         places, channels = linear_sum_assignment(np.minimum(as_channel, _STRANGE) ** 2)
         if not (as_channel[places, channels] <= _ORDER_FITS).all():
@@ -141,7 +143,7 @@ class FirstLook:
     def _deviations(self, readings: NDArray[np.float64]) -> NDArray[np.float64]:
         """Training standard deviations from the mean, (reading, channel).
 
-        0 for a pose's rotation, because training keeps only how that changes.
+        It is 0 for a pose's rotation, because training keeps only the change of that.
         """
         assert self._state is not None
         values = torch.from_numpy(readings.astype(np.float32))[:, None]
@@ -160,7 +162,7 @@ class FirstLook:
 def _fits_better(seen: Palette, own: Sequence[Palette], other: Sequence[Palette]) -> bool:
     """Whether a palette is clearly of the other kind, and both kinds can be told apart.
 
-    They can where each golden palette, held against the rest of its kind, is as clearly of its own.
+    They can if each golden palette, compared with the rest of its kind, is as clearly of its own.
     """
     if len(own) < 2 or len(other) < 2:
         return False
@@ -179,9 +181,9 @@ def _fits_better(seen: Palette, own: Sequence[Palette], other: Sequence[Palette]
 
 
 def _distance(palette: Palette, kind: Sequence[Palette]) -> float:
-    """Root mean square in grey levels to the nearest palette of a kind.
+    """Root mean square distance, in grey levels, to the nearest palette of a kind.
 
-    Squares, so that a small object of a strong colour counts.
+    With squares, a small object of a strong colour counts.
     """
     return min(float(np.sqrt(np.square(palette - golden).mean())) for golden in kind)
 

@@ -1,11 +1,13 @@
 """Drives a robot with LeRobot's interface from the control loop; lerobot is not imported.
 
-LeRobot's `Robot` (github.com/huggingface/lerobot, src/lerobot/robots/robot.py) observes as one flat
-dict with a float a motor (`shoulder_pan.pos`) and an RGB image a camera, takes such a dict as the
-action, and returns the action that it really sent. `observation_features` and `action_features`
-name both without a connection. It gives no times. Motors are read within a call, so readings have
-the time at which the call began. Cameras grab on threads of their own, so an image is older, by up
-to the period of its camera: set `camera_latency_s`, or frames and features seem that much younger.
+LeRobot's `Robot` (github.com/huggingface/lerobot, src/lerobot/robots/robot.py) returns an
+observation as one flat dict with a float for each motor (`shoulder_pan.pos`) and an RGB image for
+each camera. It takes such a dict as the action, and returns the action that it really sent.
+`observation_features` and `action_features` list the keys of both without a connection.
+
+It gives no times. Motors are read during a call, so readings get the time at which the call began.
+Cameras take images on threads of their own, so an image is older, by up to its camera's period: set
+`camera_latency_s`, or frames and features seem that much younger than they are.
 """
 
 import threading
@@ -22,16 +24,16 @@ _DELTA, _PLACE = "delta_", ".pos"
 _PORT_S = 0.2
 """How long a stop waits for another call that holds the robot's port."""
 _ROWS = 8
-"""Every so many rows of an image are compared; a camera's noise changes each row."""
+"""To see whether an image has changed, one of so many rows is compared: noise changes each row."""
 
 
 class LeRobotArm:
     """A LeRobot-style robot for a policy with this metadata.
 
-    A channel of the policy is the motor of that name, with or without `.pos` and, for an action, a
-    leading `delta_`; or the motor that `motors` names for it. A view is the camera of that name, or
-    the one that `cameras` names. Numbers pass through in the policy's units: configure the robot
-    for them.
+    A channel of the policy belongs to the motor of the same name, where a leading `delta_` and a
+    final `.pos` make no difference, or to the motor that `motors` names for it. A view belongs to
+    the camera of the same name, or to the one that `cameras` names. Numbers are passed on
+    unchanged: configure the robot for the policy's units.
     """
 
     def __init__(
@@ -93,9 +95,9 @@ class LeRobotArm:
         return observed
 
     def frames(self) -> dict[str, tuple[float, NDArray[np.uint8]]]:
-        """By view, the frame of the newest observation: when it was taken, s, and RGB.
+        """The frames of the newest observation by view: capture time in s, and RGB image.
 
-        An image that has not changed keeps its time, so that the frame of a stuck camera ages.
+        An image that has not changed keeps its time, so the frame of a stuck camera ages.
         """
         taken_s = self._time_s - self._camera_latency_s
         frames: dict[str, tuple[float, NDArray[np.uint8]]] = {}
@@ -109,9 +111,10 @@ class LeRobotArm:
         return frames
 
     def act(self, action: NDArray[np.floating[Any]]) -> None:
-        """Send an action (action_dim,); a delta is added to where the motor was last sent.
+        """Send an action (action_dim,); a delta is added to the motor's last goal.
 
-        The first delta is added to where the motor is. A robot that clips returns where it sent it.
+        The first delta is added to the motor's position. If the robot clips a goal, the goal that
+        it returns counts.
         """
         goal = dict(zip(self._action, map(float, action), strict=True))
         for key, moving in zip(self._action, self._moving, strict=True):
@@ -121,10 +124,10 @@ class LeRobotArm:
             self._send(goal)
 
     def stop(self, reason: str) -> None:
-        """Hold the place of the newest observation, without observing again, which may block.
+        """Hold the position of the newest observation; observing again might block.
 
-        From any thread. Where another call holds the port, the stop is sent all the same, and says
-        so.
+        It may be called from any thread. If another call holds the port, the stop is sent all the
+        same, with a warning.
         """
         free = self._port.acquire(timeout=_PORT_S)
         try:
@@ -147,7 +150,7 @@ def describe(
 ) -> dict[str, Any]:
     """The description of a LeRobot robot for `PolicyClient(robot=...)`, with absolute actions.
 
-    Motors stand in the robot's order, under the names that `motors` and `cameras` give. For a
+    Motors and cameras are in the robot's order, with the names of `motors` and `cameras`. For a
     policy of deltas replace `action` and `action_kind`; add `state_units` and `action_units` where
     the training data had any.
     """

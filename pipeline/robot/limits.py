@@ -1,7 +1,7 @@
 """The limits of a robot's motion, workspace and force, from a YAML file. Numpy only.
 
-Limits of motion (`step`, `speed`, `acceleration`) apply to each action before it is sent; those of
-workspace and force apply to the readings, each tick before anything is sent.
+Limits of motion (`step`, `speed`, `acceleration`) apply to each action before it is sent. Limits of
+workspace and force apply to the readings of each tick, before anything is sent.
 """
 
 from collections.abc import Mapping
@@ -29,7 +29,7 @@ class _Bound:
     channels: list[int]
     most: float
     per_tick: float
-    """`most` as the motion of a tick, or, for an acceleration, its change from tick to tick."""
+    """`most` as a motion in one tick or, for an acceleration, as its change from tick to tick."""
     clips: bool
 
 
@@ -48,8 +48,8 @@ class Limits:
     """The limits of a file for a robot of this metadata, and the action that was sent last.
 
     `hz` is the number of actions a second. Raises `ConfigError` for a channel that the robot does
-    not have, and for a motion limit on an absolute channel that the state does not have: nobody
-    knows how far its first action leads.
+    not have, and for a motion limit on an absolute channel that the state does not have: it is
+    unknown how far the first action moves such a channel.
     """
 
     def __init__(self, file: LimitsFile, metadata: Mapping[str, Any], hz: float) -> None:
@@ -62,7 +62,7 @@ class Limits:
         self._per_tick = np.where(self._goes_on, 1 / hz, 1.0)
         self._state_of = [self._place("state", name) for name in self._names]
         self.clipped = 0
-        """Ticks in which an action was cut short."""
+        """Ticks in which an action was clipped."""
         rates = {"step": 1.0, "speed": hz, "acceleration": hz * hz}
         self._bounds = [
             bound
@@ -97,7 +97,7 @@ class Limits:
         return {bound.stream for bound in self._ranges} | ({"state"} if follows else set())
 
     def reset(self) -> None:
-        """Begin again with a robot that stands still where its next reading says."""
+        """Begin again: the robot stands still at the position of its next reading."""
         self._reference = np.full(len(self._names), np.nan)
         self._moved, self._sent = np.zeros(len(self._names)), False
 
@@ -120,10 +120,10 @@ class Limits:
             self._reference = np.array(held)
 
     def allow(self, action: Vector) -> Vector:
-        """The action (action,) within the limits; the same array where it is within them already.
+        """The action (action,), clipped to the limits; the same array if it is within them.
 
         Raises `SafeStop` for a motion beyond a limit that stops, or beyond any limit after another
-        has clipped it.
+        limit has clipped it.
         """
         absolute, at = self._absolute, self._reference
         wanted = np.where(absolute, action - at, action * self._per_tick)
@@ -141,7 +141,7 @@ class Limits:
         return action
 
     def stood_still(self) -> None:
-        """Note that nothing was sent for a tick or more; velocities went on meanwhile."""
+        """Note that nothing was sent for a tick or more; velocity channels moved on meanwhile."""
         self._moved = np.where(self._goes_on, self._moved, 0.0)
 
     def _bounded(self, moved: Vector, bound: _Bound, clips: bool) -> Vector:

@@ -1,6 +1,6 @@
 """Live features of a policy, and the proof that they come from the model it was trained on.
 
-The feature specs are compared before a weight is loaded. The golden rows see what no spec tells:
+The feature specs are compared before a weight is loaded. The golden rows show what no spec shows:
 another attention backend or GPU, weights altered in memory, other code that prepares frames.
 """
 
@@ -38,7 +38,7 @@ class LiveFeatures:
         """Load the model; `trained` is the feature spec of the policy's checkpoint.
 
         Raises `CheckpointMismatch`, before a weight is loaded, where the model gives other features
-        than the policy was trained on, and `VLMError` as `LiveVLM.load`.
+        than the policy was trained on, and `VLMError` as `LiveVLM.load` does.
         """
         self.spec = live_spec(vlm, trained["views"])
         """The spec of the features that this model gives."""
@@ -68,12 +68,12 @@ class LiveFeatures:
 
 
 def prove(checkpoint: PolicyCheckpoint, features: LiveFeatures, say: Callable[[str], None]) -> None:
-    """Compute the checkpoint's golden rows, one pass a row as a robot asks for it, and compare.
+    """Compute the checkpoint's golden rows again, one row a pass as for a robot, and compare them.
 
-    Raises `CheckpointMismatch` beyond the tolerance; it names slots, deviations, both prompts where
+    Raises `CheckpointMismatch` beyond the tolerance; it names slots, deviations, both prompts if
     they differ, and the entries of the feature spec that differ. `say` gets the largest deviation
-    of a number, relative to the root mean square of its slot, or a warning where the checkpoint has
-    no golden rows.
+    of a number, relative to the root mean square of its slot, or a warning if the checkpoint has no
+    golden rows.
     """
     if not checkpoint.golden:
         say(

@@ -1,9 +1,12 @@
 """One robot's control loop: what is due in a tick, and the action of the tick. Numpy only.
 
-Its only clock is its ticks, so that a rollout and a robot in real time run the same loop. In each
-tick the driver calls, in this order: `begin_tick`; where `frames_due`, `pass_began`, and
-`pass_ended` once the features of these frames are there; where `chunk_due`, `ask`, and `plan` with
-the answered chunk, at once or ticks later; then `action`.
+Its only clock is its ticks, so a rollout and a robot in real time run the same loop. In each tick
+the driver calls, in this order:
+
+1. `begin_tick`.
+2. If `frames_due`: `pass_began`, and `pass_ended` when the features of these frames are ready.
+3. If `chunk_due`: `ask`, and `plan` with the answered chunk, at once or some ticks later.
+4. `action`.
 """
 
 from enum import StrEnum
@@ -47,7 +50,10 @@ class SafeStop(Exception):
 
 
 class ControlLoop:
-    """The loop of a policy; `uses_features` where it needs the model, one pass in `reuse` ticks."""
+    """The loop of a policy.
+
+    With `uses_features` the policy needs the model, which makes one pass in `reuse` ticks.
+    """
 
     def __init__(self, executor: Executor, reuse: int, uses_features: bool) -> None:
         self.executor, self._reuse, self._uses_features = executor, reuse, uses_features
@@ -74,7 +80,7 @@ class ControlLoop:
         self._pass_began, self._under_way = self._tick, True
 
     def pass_ended(self) -> None:
-        """Note that the features of the last pass are there."""
+        """Note that the features of the last pass are ready."""
         self._under_way = False
 
     @property
@@ -83,12 +89,12 @@ class ControlLoop:
         return self.executor.due
 
     def ask(self) -> PlanGuide | None:
-        """Note that the chunk is asked for now; the plan that it is to continue."""
+        """Note that the next chunk is requested now; returns the plan that it should continue."""
         self._asked = self._tick
         return self.executor.begin()
 
     def refused(self) -> None:
-        """Note that the last question is not answered, nor its frames looked at."""
+        """Note that the last question is not answered and its frames were not used."""
         self.executor.refused()
         if self._pass_began == self._asked:
             self._pass_began, self._under_way = self._asked - self._reuse, False
@@ -103,9 +109,9 @@ class ControlLoop:
         self.executor.plan(chunk)
 
     def action(self) -> NDArray[np.float64] | None:
-        """The action of this tick; None, stand still, before the first chunk.
+        """The action of this tick; None, which means stand still, before the first chunk.
 
-        Raises `SafeStop` where the plan is used up before the next chunk has come.
+        Raises `SafeStop` if the plan is used up before the next chunk has come.
         """
         if not self.executor.planned:
             return None

@@ -31,12 +31,12 @@ class RobotObservation:
     """One checked observation of a robot."""
 
     readings: Mapping[str, NDArray[Any]]
-    """For `RobotMemory.sense`: `time` (1,), and of each stream that came, its readings (reading,
+    """For `RobotMemory.sense`: `time` (1,), and for each stream received, its readings (reading,
     channel) in float32 and their times (reading,) in float64."""
     frames: Mapping[str, NDArray[np.uint8]]
-    """RGB (height, width, 3) of each view that came, in the policy's order."""
+    """RGB (height, width, 3) of each view received, in the policy's order."""
     frame_time_s: NDArray[np.float64]
-    """(view,) over all views of the policy; NaN of a missing one."""
+    """(view,) for all views of the policy; NaN for a missing view."""
     prompt: str | None
     reset: bool
     seed: int | None
@@ -70,10 +70,10 @@ class ObservationReader:
         self._newest_s: Mapping[str, float] = {}
 
     def read(self, given: Any) -> RobotObservation:
-        """The observation of these fields. Raises `ObservationError`.
+        """The observation made of these fields. Raises `ObservationError`.
 
         `time` defaults to the newest time among the fields, else to this machine's clock. A frame
-        or a single reading without a time has `time`. Fields may be nested: `images` with views.
+        or a single reading without a time gets `time`. Fields may be nested: `images` with views.
         """
         if not isinstance(given, Mapping):
             raise ObservationError(f"expected fields by name, found {type(given).__name__}")
@@ -108,7 +108,7 @@ class ObservationReader:
         return observation
 
     def _values(self, given: Mapping[str, Any]) -> dict[str, NDArray[Any]]:
-        """The readings (reading, channel) of each stream that came; a frame is one reading."""
+        """The readings (reading, channel) of each stream received; a frame is one reading."""
         values: dict[str, NDArray[Any]] = {}
         for name in self._clocks:
             if name in given and name in self._widths:
@@ -139,7 +139,7 @@ class ObservationReader:
     def _follow(
         self, before: Mapping[str, float], times: Mapping[str, NDArray[np.float64]]
     ) -> Mapping[str, float]:
-        """The newest times of `before` and `times`, which must follow one another."""
+        """The newest times by name; raises unless `times` are in order and follow `before`."""
         newest_s, now_s = dict(before), times["time"][0]
         for name, own in times.items():
             after = before.get(name, -np.inf)

@@ -36,19 +36,19 @@ class PolicyThread:
         self._thread.start()
 
     def ask(self, question: Mapping[str, Any]) -> None:
-        """Ask while no answer is awaited."""
+        """Send a question; call it only while no answer is awaited."""
         self.busy = True
         self._questions.put(question)
 
     def forget(self) -> None:
-        """Drop the answer that is awaited, if any, when it comes."""
+        """Drop the awaited answer, if any, when it comes."""
         self._stale = self.busy
 
     def take(self) -> Answer | None:
-        """The answer where it has come.
+        """The answer if it has come, else None.
 
-        Raises `SafeStop` where the policy failed, `ServerBusy` where the server does not answer
-        this question.
+        Raises `SafeStop` if the policy failed, and `ServerBusy` if the server does not answer this
+        question.
         """
         try:
             self.took_s, answer = self._answers.get_nowait()
@@ -66,7 +66,7 @@ class PolicyThread:
         return answer
 
     def close(self) -> None:
-        """Ask no more; do not wait for an answer that takes long."""
+        """Ask no more; wait for an awaited answer, but at most 5 s."""
         self._questions.put(None)
         self._thread.join(timeout=5.0)
 
@@ -86,10 +86,10 @@ class PolicyThread:
 
 
 class Watchdog:
-    """Stops the robot when the loop ends no tick any more.
+    """Stops the robot when the loop hangs, so that no tick ends any more.
 
-    It counts its own looks and not seconds, so that a process that was suspended as a whole, and
-    goes on, does not count as a loop that hangs.
+    It counts its own looks and not seconds. So a process that was suspended as a whole, and then
+    resumed, does not count as a loop that hangs.
     """
 
     LOOKS = 5
@@ -100,7 +100,7 @@ class Watchdog:
         self._closed = threading.Event()
         self._thread = threading.Thread(target=self._watch, name="watchdog", daemon=True)
         self.reason = self.failed = ""
-        """Why it has stopped the robot, and the tracebacks where that raised."""
+        """Why it has stopped the robot, and the tracebacks if stopping raised errors."""
         self._thread.start()
 
     def beat(self) -> None:
@@ -108,12 +108,12 @@ class Watchdog:
         self._beats += 1
 
     def check(self) -> None:
-        """Raise `SafeStop` where it has stopped the robot."""
+        """Raise `SafeStop` if the watchdog has stopped the robot."""
         if self.reason:
             raise SafeStop(StopKind.HUNG, self.reason)
 
     def close(self) -> None:
-        """Look no more."""
+        """Stop watching."""
         self._closed.set()
         self._thread.join(timeout=1.0)
 
@@ -127,7 +127,7 @@ class Watchdog:
 
 
 def stop_firmly(stop: Callable[[str], object], reason: str) -> str:
-    """Stop the robot, and once more where that raises; the tracebacks, empty where none raised."""
+    """Stop the robot; try once more if that raises. Returns the tracebacks, else an empty text."""
     failed = ""
     for _ in range(2):
         try:
@@ -140,9 +140,9 @@ def stop_firmly(stop: Callable[[str], object], reason: str) -> str:
 
 @contextmanager
 def undisturbed(fifo_priority: int) -> Generator[None]:
-    """Run this thread first and without garbage collection, which the loop does not need.
+    """Run this thread before others and without garbage collection, which the loop does not need.
 
-    Raises `ConfigError` where the machine does not grant the priority; 0 asks for none.
+    Raises `ConfigError` if the machine does not grant the priority; 0 requests none.
     """
     switch_s, collects = sys.getswitchinterval(), gc.isenabled()
     if fifo_priority not in (0, *range(2, 100)):
@@ -176,8 +176,8 @@ def undisturbed(fifo_priority: int) -> Generator[None]:
 def ended_by_hand() -> Generator[list[str]]:
     """Raise `KeyboardInterrupt` at the first signal that ends the process; ignore later ones.
 
-    Signals are ignored as soon as the yielded list, of their names, is not empty. Only the main
-    thread can set handlers.
+    The yielded list gets the names of the signals; as soon as it is not empty, signals are ignored.
+    Only the main thread can set handlers; in another thread, signals act as before.
     """
     ended: list[str] = []
     before: dict[int, Any] = {}

@@ -1,4 +1,4 @@
-"""A robot's readings until they go to the policy, and its clock; both checked. Numpy only."""
+"""A robot's readings before they go to the policy, and its clock; both are checked. Numpy only."""
 
 import math
 import time
@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 from pipeline.robot.loop import SafeStop, StopKind
 
 _FIRST_OBSERVATIONS = 10
-"""Observations that the offset of the robot's clock is measured over."""
+"""The number of observations over which the offset of the robot's clock is measured."""
 
 
 class PendingReadings:
-    """The readings of a stream since the last question: the newest `most` where there are more."""
+    """The readings of a stream since the last question, but only the newest `most` of them."""
 
     def __init__(self, most: int, channels: int) -> None:
         self.channels, self.dropped = channels, 0
@@ -53,22 +53,22 @@ class PendingReadings:
         self.dropped += total - len(self._pending)
 
     def hand_over(self) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
-        """The pending readings and their times, which are then no longer pending."""
+        """Return the pending readings and their times, and remove them from here."""
         values, times = zip(*self._pending, strict=True)
         self._pending.clear()
         return np.stack(values), np.array(times)
 
 
 class RobotClock:
-    """The robot's clock beside `time.monotonic()`: its offset is set once, then watched.
+    """The robot's clock compared with `time.monotonic()`: its offset is set once, then watched.
 
-    A clock that is 50 ppm off leaves its offset by 0.1 s, the default of `drift_s`, after some 33
-    minutes. For longer runs synchronize the clocks (NTP, PTP), let the robot use
-    `time.monotonic()`, or allow more drift.
+    A clock that is 50 ppm off drifts by 0.1 s, the default of `drift_s`, in some 33 minutes. For
+    longer runs synchronize the clocks (NTP, PTP), let the robot use `time.monotonic()`, or allow
+    more drift.
     """
 
     def __init__(self, offset_s: float | None, drift_s: float) -> None:
-        """`offset_s` is the robot's clock less ours; None measures it."""
+        """`offset_s` is the robot's clock minus ours; with None it is measured."""
         self._declared, self._drift_s = offset_s, drift_s
         self.offset_s = -math.inf if offset_s is None else offset_s
         self._seen = 0
@@ -78,7 +78,7 @@ class RobotClock:
         return time.monotonic() + self.offset_s
 
     def check(self, time_s: float) -> None:
-        """Compare a time that the robot just gave; raises `SafeStop` where the offset has moved."""
+        """Check a time that the robot just gave; raises `SafeStop` if the offset has moved."""
         offset = time_s - time.monotonic()
         self._seen += 1
         if self._declared is None and self._seen <= _FIRST_OBSERVATIONS:

@@ -31,16 +31,16 @@ from pipeline.robot.run_recording import (
 MOST_IMAGE_BYTES: Final = 2**27
 """Images are dropped when more than this waits to be written."""
 MOST_BYTES: Final = 2**28
-"""Recording fails when more than this waits to be written, for readings cannot be dropped."""
+"""Recording fails when more than this waits to be written, because readings cannot be dropped."""
 _FASTEST: Final = {"compression_level": "1", "pred": "up"}
 
 
 class RunRecorder:
     """Records one run on a robot, of any embodiment, as `run_NNNNNN` in a folder.
 
-    In each tick the loop calls `frames` and `answer` where there are new ones, then `tick`, also in
-    the tick that ends a run, whose readings may be the reason. None of them waits or raises. A kill
-    leaves `run_NNNNNN.part`, which `recover` finishes.
+    In each tick the loop calls `frames` and `answer` if there are new ones, then `tick`. It does so
+    in the tick that ends a run too, because its readings may be the reason. None of them waits or
+    raises. A kill leaves `run_NNNNNN.part`, which `recover` finishes.
     """
 
     def __init__(
@@ -74,10 +74,10 @@ class RunRecorder:
         return None if self._error is None else f"{type(self._error).__name__}: {self._error}"
 
     def frames(self, frames: Mapping[str, tuple[float, NDArray[np.uint8]]]) -> None:
-        """Record frames for the model: by view when each was captured (s), and RGB.
+        """Record frames for the model: the capture time (s) and RGB image of each view.
 
         A frame no newer than the last of its view is the same frame. Cameras that the policy does
-        not look at are ignored; an image that finds no room in the queue is dropped and counted.
+        not use are ignored; an image that does not fit into the queue is dropped and counted.
         """
         with self._unharmed():
             for view, (time, image) in frames.items():
@@ -103,8 +103,8 @@ class RunRecorder:
     def tick(self, observed: Mapping[str, Any], action: ArrayLike | None) -> None:
         """Record a tick: its `time`, the readings since the last, and the action that was sent.
 
-        Without an action the tick is no row, but its readings are kept. A recording is one episode:
-        it fails, and keeps what came before, where `reset` begins another.
+        A tick without an action makes no row, but its readings are kept. A recording is one
+        episode: if `reset` begins another, it fails and keeps only the first.
         """
         with self._unharmed():
             if observed.get("reset") and self._tick["time"] > -np.inf:
@@ -140,7 +140,7 @@ class RunRecorder:
 
     @contextmanager
     def _unharmed(self) -> Generator[None]:
-        """Turn an error into one of the recording; the loop, whose robot moves, goes on."""
+        """Note an error as the recording's; the loop, whose robot is moving, goes on."""
         try:
             yield
         except Exception as error:
@@ -160,7 +160,7 @@ class RunRecorder:
         self._queue.put((work, size))
 
     def _write(self) -> None:
-        """The thread: write in the order of `_put`, until something cannot be written."""
+        """Run in the thread: write in the order of `_put`, until a write fails."""
         whole = True
         for work, size in iter(self._queue.get, None):
             if whole:

@@ -32,7 +32,7 @@ class ReadingWindow:
         self.time_s = np.concatenate([self.time_s, time_s])[-kept:]
 
     def at(self, now_s: float) -> tuple[NDArray[np.float32], int, NDArray[np.float32]]:
-        """The readings, how many at the end are valid, and the ages in s; 0 where not valid."""
+        """The readings, how many at the end are valid, and the ages in s; both 0 if not valid."""
         age_s = now_s - self.time_s
         valid = np.isfinite(age_s) & (age_s <= self._oldest_s)
         ages = np.where(valid, age_s, 0).astype(np.float32)
@@ -46,13 +46,13 @@ class SeenFeatures:
     features: NDArray[np.float32]
     slot_valid: NDArray[np.bool_]
     frame_time_s: NDArray[np.float64]
-    """(view,) in s, NaN of a missing view."""
+    """(view,) in s, NaN for a missing view."""
     key: bytes = b""
-    """`row_key` of the frames and prompt, where a session computed the features."""
+    """`row_key` of the frames and prompt; empty unless a session computed the features."""
 
 
 def older_than_trained(age_s: float, trained_age_s: float) -> bool:
-    """Whether features are older than any in training, by more than clocks are off."""
+    """Whether features are older than any in training, by over 10 %: clocks are not exact."""
     return age_s > 1.1 * trained_age_s
 
 
@@ -88,7 +88,7 @@ class RobotMemory:
     def observation(self) -> dict[str, NDArray[Any]]:
         """The fields of an `Observation` of one sample, without features until the first came.
 
-        An age is now less the time of the reading or of the frame.
+        An age is the current time minus the time of the reading or frame.
         """
         fields: dict[str, NDArray[Any]] = {}
         for name, window in self._windows.items():

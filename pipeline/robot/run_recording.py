@@ -1,8 +1,8 @@
 """From the logs of a run on a robot to a recording, a LeRobot data set of one episode.
 
-While a robot runs, its recorder appends to plain logs in `run_000003.part`, which a kill can only
-cut off: `<log>.bin` with rows of `log_types`, and a PNG a frame. `finish_recording` turns them into
-`run_000003`, a LeRobot v3.0 data set with this project's sidecars:
+While a robot runs, its recorder appends to plain logs in `run_000003.part`: `<log>.bin` with rows
+of `log_types`, and a PNG for each frame. A kill can only cut off their end. `finish_recording`
+turns them into `run_000003`, a LeRobot v3.0 data set with this project's sidecars:
 
     data, meta             a row for each tick with an action, images without loss; a row for every
                            tick, without `action`, where the whole run has none
@@ -11,7 +11,7 @@ cut off: `<log>.bin` with rows of `log_types`, and a PNG a frame. `finish_record
     features               the features behind each action: `row_key` and age
     run.json               the policy's metadata, the settings, and why the run ended
 
-Times are seconds since the first row; `run.json` says when that was on the robot's clock.
+Times are seconds since the first row; `run.json` has the first row's time on the robot's clock.
 """
 
 import re
@@ -46,7 +46,7 @@ Log = NDArray[Any]
 
 
 class RunDocument(Document):
-    """The content of `run.json`; fields that are not named here are kept, too."""
+    """The content of `run.json`; fields that are not declared here are kept, too."""
 
     model_config = ConfigDict(extra="allow")
 
@@ -101,8 +101,8 @@ def frame_path(part: Path, number: int) -> Path:
 def finish_recording(part: Path, end: Mapping[str, Any]) -> Path:
     """Turn a run's logs into its recording and return the folder.
 
-    `end` is added to `run.json`. Until all is written the logs stay, and nothing looks like a
-    recording. Raises `RecordingError` where there is no tick, and for any other folder.
+    `end` is added to `run.json`. Until all is written the logs stay, and no folder looks like a
+    recording. Raises `RecordingError` if there is no tick, and for any other folder.
     """
     if part.suffix != ".part":
         raise RecordingError(f"{part}: expected what is left of a run, run_NNNNNN.part")
@@ -115,7 +115,7 @@ def finish_recording(part: Path, end: Mapping[str, Any]) -> Path:
             f"{part}: expected a tick of the run, found none: the robot was never observed, so "
             f"there is nothing to make a recording of. Look into {RUN}, and remove {part}"
         )
-    root = part / ".recording"  # what begins with a dot is not searched for recordings
+    root = part / ".recording"  # folders that begin with a dot are not searched for recordings
     begin_folder(root, _RUN)
     left_out = _write_readings(root, run, logs, float(rows["time"][0]))
     counts = {"ticks": len(logs["tick"]), "rows": len(rows), "readings_left_out": left_out}
@@ -141,8 +141,8 @@ def _read(part: Path, name: str, kind: "np.dtype[Any]") -> Log:
 def _rows(logs: Mapping[str, Log]) -> Log:
     """The ticks that become rows: those with an action once all streams have begun.
 
-    Without an action in the whole run every tick may be a row. A tick in which the robot's clock
-    stood still is none, because a recording's clock rises.
+    If the whole run has no action, every tick may be a row. A tick in which the robot's clock stood
+    still is left out, because a recording's clock rises.
     """
     ticks = logs["tick"]
     if ticks["acted"].any():
@@ -156,12 +156,12 @@ def _rows(logs: Mapping[str, Log]) -> Log:
 def _write_readings(
     root: Path, run: RunDocument, logs: Mapping[str, Log], start_s: float
 ) -> dict[str, int]:
-    """Write the sidecars of readings; by stream how many are left out as NaN or out of order."""
+    """Write the sidecars of readings; returns how many NaN or disordered ones each leaves out."""
     left_out: dict[str, int] = {}
     for name in READINGS:
         if len(log := logs[name]):
             times = log["time"]
-            backwards = times < np.fmax.accumulate(times)  # a clock that stopped the robot
+            backwards = times < np.fmax.accumulate(times)  # such a clock stops the robot
             bad = np.flatnonzero(
                 non_finite(log["values"]).any(axis=1) | ~np.isfinite(times) | backwards
             )
@@ -194,7 +194,7 @@ def _write_rows(
         key = f"observation.images.{view}"
         images[key] = [frame_path(part, index) for index in number.tolist()]
         features[key] = {"shape": shown["shape"][number[0]].tolist()}
-        # A camera may take a frame between the beginning of a tick and the question for it.
+        # A camera may take a frame between the beginning of a tick and the request for the frame.
         came = rows["time"][np.searchsorted(number, number)]
         captured[view] = np.minimum(shown["time"][number], came) - start
     if captured:

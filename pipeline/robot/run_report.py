@@ -15,12 +15,12 @@ from pipeline.base.table import Table
 from pipeline.robot.loop import StopKind
 
 TickPart = Literal["late", "observe", "check", "plan", "frames", "ask", "act", "record"]
-"""late: from the deadline to the beginning of the tick; the others in the order of a tick."""
+"""late: from the deadline to the beginning of the tick; the others are in the order of a tick."""
 TICK_PARTS: tuple[TickPart, ...] = get_args(TickPart)
 ANSWER_PARTS = ("answer", "infer_ms", "vlm_ms", "head_ms", "wait_ms")
 """answer: from the question to its answer; the others come from the answer's `server_timing`."""
 KEPT = 65536
-"""Newest ticks whose timings and actions a report keeps."""
+"""A report keeps the timings and actions of so many newest ticks."""
 PERCENTILES = {"p50": 50.0, "p99": 99.0, "p99.9": 99.9}
 
 
@@ -30,7 +30,7 @@ class Ring:
     def __init__(self, rows: int, columns: int) -> None:
         self._buffer = np.full((rows, columns), np.nan)
         self.count = 0
-        """Rows that were ever added."""
+        """The number of rows ever added."""
 
     def note(self, row: Sequence[float] | NDArray[np.float64]) -> None:
         """Add a row, in place of the oldest where the buffer is full."""
@@ -44,14 +44,14 @@ class Ring:
 
 
 class Timings(Ring):
-    """Milliseconds of parts, a row a tick or an answer; NaN where a part did not happen."""
+    """Milliseconds of parts, a row for each tick or answer; NaN if a part did not happen."""
 
     def __init__(self, parts: Sequence[str], rows: int) -> None:
         self.parts = tuple(parts)
         super().__init__(rows, len(self.parts))
 
     def document(self) -> dict[str, dict[str, float]]:
-        """By part over the kept rows: how often it happened, percentiles and maximum in ms."""
+        """For each part, over the kept rows: its count, and percentiles and maximum in ms."""
         parts: dict[str, dict[str, float]] = {}
         for part, column in zip(self.parts, self.rows().T, strict=True):
             if len(values := column[~np.isnan(column)]):
@@ -71,24 +71,24 @@ class TickTimer:
     """The seconds that each part of one tick takes."""
 
     def begin(self, deadline: float) -> None:
-        """A new tick, late from its deadline on."""
+        """Begin a tick; the time since its deadline counts as late."""
         self.seconds: dict[TickPart, float] = {}
         self.part: TickPart = "late"
         self._since = deadline
 
     def mark(self, part: TickPart) -> None:
-        """End the part before, and begin `part`."""
+        """End the current part, and begin `part`."""
         now = time.monotonic()
         self.seconds[self.part] = self.seconds.get(self.part, 0.0) + now - self._since
         self.part, self._since = part, now
 
     def end(self) -> float:
-        """End the tick; when that was, s."""
+        """End the tick; returns the time of its end in s."""
         self.mark("late")
         return self._since
 
     def row_ms(self) -> list[float]:
-        """The ms of each of `TICK_PARTS`, NaN of a part that did not happen, and of the tick."""
+        """The ms of each of `TICK_PARTS`, NaN if it did not happen, and last those of the tick."""
         tick = sum(seconds for part, seconds in self.seconds.items() if part != "late")
         return [*(1000 * self.seconds.get(part, math.nan) for part in TICK_PARTS), 1000 * tick]
 
@@ -115,9 +115,9 @@ class RunReport:
         self.answer_timings = Timings(ANSWER_PARTS, KEPT)
         self.missed = deque[MissedTick](maxlen=KEPT)
         self.sent = Ring(KEPT, 2 + action_dim)
-        """Of each tick with an action: its number, the robot's time, and the action."""
+        """For each tick with an action: its number, the robot's time, and the action."""
         self.ticks = self.left_out = self.missed_ticks = 0
-        """Ticks that were run; that were not, because one before took too long; that were late."""
+        """Ticks that were run, ticks skipped because one before took too long, and late ticks."""
         self.busy = 0
         """Questions that the policy's server was too busy to answer; it took their readings."""
         self.dropped_readings = 0
@@ -125,12 +125,12 @@ class RunReport:
         self.old_features = 0
         """Answers from features that were older than the policy was trained for."""
         self.clipped = 0
-        """Ticks in which limits let less through than was wanted."""
+        """Ticks in which limits clipped the action."""
         self.clock_offset_s = math.nan
-        """The robot's clock less `time.monotonic()`."""
+        """The robot's clock minus `time.monotonic()`."""
         self.recording: Path | None = None
         self.traceback = ""
-        """Of what raised, also in stopping and in recording; empty where all went well."""
+        """Tracebacks of all errors, also in stopping and in recording; empty if all went well."""
 
     @property
     def answers(self) -> int:

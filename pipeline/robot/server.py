@@ -1,8 +1,8 @@
 """The policy server: openpi's protocol over a websocket; beside it `/healthz`, `/status.json`.
 
 A connection is one robot: it gets the metadata, then an answer to each observation, in order. A
-wrong message costs its own connection only: one line of text says why, `refused: …` or `error: …`,
-and the connection is closed. After `busy: …` it stays open.
+wrong message closes its own connection only, after one line of text that says why: `refused: …` or
+`error: …`. After `busy: …` the connection stays open.
 """
 
 import asyncio
@@ -46,7 +46,7 @@ CLOSING_S: Final = 30.0
 def read_token(params: ServeParams) -> str | None:
     """The token of `serve.token_file`, else of the environment, else None.
 
-    Raises `ConfigError` for an empty token, and for a host that needs one without one.
+    Raises `ConfigError` for an empty token, and for a missing one if the host needs it.
     """
     token, file = os.environ.get(TOKEN_VARIABLE), params.token_file
     try:
@@ -73,7 +73,7 @@ def read_token(params: ServeParams) -> str | None:
 def listen(params: ServeParams) -> socket.socket:
     """A socket at `serve.host` and `serve.port`, not yet listening.
 
-    Raises `ConfigError` where the address is not of this machine, or is taken.
+    Raises `ConfigError` if the address is not one of this machine, or is taken.
     """
     with ExitStack() as undo:
         try:
@@ -123,14 +123,14 @@ class PolicyServer:
         self._stop: Callable[[], object] = lambda: None
 
     def run(self, started: Callable[[], None] = lambda: None) -> bool:
-        """Serve, and call `started` once robots can connect; whether a signal ended it."""
+        """Serve, and call `started` once robots can connect; returns whether a signal ended it."""
         try:
             return asyncio.run(self._run(started))
         finally:
             self._threads.shutdown()
 
     def stop(self) -> None:
-        """End `run` from any thread, once it has begun; observations that came are answered."""
+        """End `run` from any thread, once it has begun; received observations are answered."""
         with suppress(RuntimeError):  # it has ended already
             self._stop()
 
@@ -160,7 +160,7 @@ class PolicyServer:
         return by_signal
 
     async def _close(self, server: Server) -> None:
-        """Refuse new connections, answer the observations that came, then close with 1001."""
+        """Refuse new connections, answer the observations received, then close with 1001."""
         self._stopping = True
         server.close(close_connections=False)
         await asyncio.gather(*(_leave(connection) for connection in self._idle))
@@ -256,7 +256,7 @@ class PolicyServer:
             half = f"half of a chunk is {self._allowed_ms:.0f} ms"
             self.status.note("slow", robot, f"an answer took {spent_ms:.0f} ms, {half}")
         if "feature_key" in answer:
-            # Bytes, not an array: openpi's chunk broker takes every array for one of steps.
+            # Bytes, not an array: openpi's chunk broker indexes every array by step.
             answer["feature_key"] = answer["feature_key"].tobytes()
         return wire.pack(answer)
 
@@ -303,10 +303,10 @@ class PolicyServer:
         return turn_away(HTTPStatus.SERVICE_UNAVAILABLE, why)
 
     def _is_foreign(self, headers: Headers) -> bool:
-        """Whether a web page asks, through a browser on this machine.
+        """Whether the request is from a web page, through a browser on this machine.
 
-        Browsers send `Origin` with it; or, without a token, a `Host` whose name was made to mean
-        this machine.
+        Then the browser sends `Origin`, or a `Host` whose name was made to point to this machine.
+        The `Host` is checked only without a token.
         """
         host = urlsplit(f"//{headers.get('Host', '')}").hostname
         return "Origin" in headers or (self._token is None and not _is_loopback(host or ""))

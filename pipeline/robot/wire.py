@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from pipeline.base.errors import WireError
 
 MAX_BYTES: Final = 64 * 2**20
-"""Default bound of a message."""
+"""Default limit of a message's size."""
 MAX_DEPTH: Final = 12
 MAX_ENTRIES: Final = 20_000
 """Entries of all lists and maps of a message together."""

@@ -3,12 +3,12 @@
 arm.py                  pose, orientation, motion and joints of the arm that carries the needle
 needle_sensor.py        force and OCT A-scan at the needle
 layout.py               the hidden parameters of an episode
-insertion.py            the physics, one step a control tick
+insertion.py            the physics, one step for each control tick
 expert.py               the demonstrator
 rendering.py            three camera views
 environment.py          the insertion as a gymnasium environment
 realtime.py             the environment at the pace of a clock, as a robot
-recorder.py             an episode through clocks that start late and jitter
+recorder.py             an episode recorded by clocks that start late and jitter
 insertion_formats.py    writers of an episode in each format
-demo_recordings.py      the demo's sets
+demo_recordings.py      the demo's sets of recordings
 """

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from pipeline.data.timeline import ActionRotation, wrapped_deg
 
 NOMINAL_POSE = np.array([82.0, 111.0, 253.0, -136.0, 38.0, -158.0])
-"""Where a Meca500 with this tool stands, roughly, when it inserts."""
+"""The pose, roughly, of a Meca500 with this tool when it inserts."""
 
 _HOME_JOINTS_DEG = np.array([10.0, 20.0, -15.0, 5.0, 30.0, -60.0])
 _JOINTS_PER_POSE = np.array(
@@ -42,7 +42,8 @@ def angles_deg(rotation: Rotation) -> NDArray[np.float64]:
 def joints_deg(poses: NDArray[np.float64]) -> NDArray[np.float64]:
     """Joint angles (row, 6) for poses (row, 6): a stand-in, not a Meca500's inverse kinematics.
 
-    A fixed linear map around the nominal pose, one to one and smooth, also where r crosses ±180°.
+    It is a fixed linear map around the nominal pose, one to one and smooth, even where r crosses
+    ±180°.
     """
     from_nominal = poses - NOMINAL_POSE
     from_nominal[..., 3:] = wrapped_deg(from_nominal[..., 3:])
@@ -85,12 +86,12 @@ LAG_S: Final = 0.04
 _SPEED: Final = np.array([12.0, 30.0])
 """Limits of the reference's translation, mm/s, and of each angle, deg/s."""
 _ACCELERATION: Final = np.array([120.0, 300.0])
-"""Limits of how its velocity changes from tick to tick, mm/s² and deg/s²."""
+"""Limits of the change of the reference's velocity from tick to tick, mm/s² and deg/s²."""
 
 
 @dataclass(frozen=True)
 class ArmMotion:
-    """How the arm moves over a tick: its controller leads, its joints follow with a lag.
+    """How the arm moves during a tick: its controller leads, its joints follow with a lag.
 
     The reference goes from `reference` (6,) at `velocity` (6,), mm/s and deg/s. From `pose` (6,)
     the arm follows it as dp/dt = (reference - p) / LAG_S: its velocity has no steps, and its
@@ -128,6 +129,6 @@ class ArmMotion:
 
 
 def _limited(values: NDArray[np.float64], limits: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The same direction (6,), of translation and of rotation, at no more than these lengths."""
+    """The values (6,) with their direction, shortened to these limits of translation and angle."""
     lengths = np.array([np.linalg.norm(values[:3]), np.abs(values[3:]).max()])
     return values * np.repeat(np.minimum(1.0, limits / np.maximum(lengths, 1e-12)), 3)

@@ -1,4 +1,4 @@
-"""The demo's recordings: simulated episodes in every format that is read, in one folder.
+"""The demo's recordings: simulated episodes in every format that can be read, in one folder.
 
     raw/<task>/data_collection_…   new/<task>/episode_…   old/<task>/recv_all_…   lerobot/
 
@@ -36,7 +36,7 @@ from pipeline.simulation.insertion_formats import (
 from pipeline.simulation.recorder import SimulatedEpisode, simulate_episode
 
 DEMO_VERSION: Final = 2
-"""To raise whenever the same seed gives other recordings."""
+"""Raise it whenever the same seed gives other recordings."""
 MARKER: Final = "demo.json"
 _MARKERS: Final = {MARKER, files.MARKER}
 DEMO: Final = OutputKind("what the demo wrote", lambda folder: (folder / MARKER).is_file())
@@ -52,7 +52,7 @@ BORDER: Final = Border(ConfigError, "Remove the folder that it is in and run aga
 
 
 class _Marker(Document):
-    """What `demo.json` holds."""
+    """The content of `demo.json`."""
 
     version: int = 0
     episodes: int = 0
@@ -67,9 +67,9 @@ Write = Callable[[Path, Episodes], None]
 
 
 def write_demo_recordings(root: Path, episodes: int, seed: int) -> None:
-    """Make `root` hold `episodes` simulated episodes in each of the four formats.
+    """Write `episodes` simulated episodes in each of the four formats to `root`.
 
-    Each set appears whole or not at all; a set that is there already stays as it is. The same
+    Each set appears whole or not at all; a set that is already there stays as it is. The same
     arguments give the same bytes. Raises `ConfigError` where `root` holds something that the demo
     did not write, `DiskFull` where the disk is full.
     """
@@ -85,9 +85,9 @@ def write_demo_recordings(root: Path, episodes: int, seed: int) -> None:
 
 
 def _write_sets(root: Path, finished: list[str], episodes: int, seed: int) -> Iterator[str]:
-    """Write the sets that are not finished, a thread a core; the names, as they are written.
+    """Write the unfinished sets, with a thread for each core; yields each name when it is written.
 
-    Threads are enough: compressing and drawing, which take the time, run side by side in them.
+    Threads are enough: compressing and drawing, which take most of the time, run in parallel.
     """
     stop = Event()
     missing = {name: number for number, name in enumerate(_SETS) if name not in finished}
@@ -147,7 +147,7 @@ _SETS: Final[dict[str, Write]] = {
 
 
 def _finished_sets(root: Path, wanted: dict[str, int]) -> list[str]:
-    """The sets that are there as wanted; the demo's sets of other params are removed."""
+    """The sets that are there as `wanted`; removes the demo's sets of other params."""
     refuse_foreign(root, "demo.recordings")
     path = root / MARKER
     if not path.exists():

@@ -26,22 +26,23 @@ from pipeline.simulation.recorder import CAMERA_HZ, CAMERA_JITTER_S, LOST_FRAMES
 from pipeline.simulation.rendering import HEIGHT, VIEWS, WIDTH, photograph, through_jpeg
 
 _LARGEST_ACTION: Final = 5.0
-"""mm and degrees a tick, over four times what the arm can do."""
+"""mm and degrees in a tick, over four times what the arm can do."""
 _STATES_PER_TICK: Final = STATE_HZ // TICK_HZ
 
 Readings = dict[str, NDArray[Any]]
 Shots = dict[str, tuple[float, NDArray[np.uint8]]]
-"""By view: when its newest frame was taken, in s, and the frame (height, width, 3), RGB."""
+"""By view: the capture time of its newest frame in s, and the frame (height, width, 3), RGB."""
 
 
 class InsertionEnvironment(gymnasium.Env[Any, NDArray[np.floating[Any]]]):
-    """One needle insertion a seed; an action (7,) is added to the commanded setpoint.
+    """One needle insertion for each seed; an action (7,) is added to the commanded setpoint.
 
-    dx dy dz in mm in the base frame, rotation in degrees in the convention of `action_rotation`,
-    gripper (ignored). An observation has `state` (10, 12) and `sensor` (65, 1026), the readings of
-    the tick that ends now, `state_time`, `sensor_time` and `time` (1,) in s, and with `cameras`
-    `images/<view>` (126, 224, 3) RGB, the newest frames; `info["frame_time"]` says when these were
-    taken. Reward 1 for success; `info` has `success` and, at the end, its `reason`.
+    It is dx dy dz in mm in the base frame, rotation in degrees in the convention of
+    `action_rotation`, and gripper (ignored). An observation has `state` (10, 12) and `sensor` (65,
+    1026), the readings of the tick that ends now, `state_time`, `sensor_time` and `time` (1,) in s,
+    and with `cameras` `images/<view>` (126, 224, 3) RGB, the newest frames; `info["frame_time"]`
+    says when these were taken. Reward 1 for success; `info` has `success` and, at the end, its
+    `reason`.
     """
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": TICK_HZ}  # noqa: RUF012
@@ -80,7 +81,7 @@ class InsertionEnvironment(gymnasium.Env[Any, NDArray[np.floating[Any]]]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Readings, dict[str, Any]]:
-        """Begin the episode of `seed`, or of a drawn seed."""
+        """Begin the episode of `seed`, or of a random seed if None."""
         super().reset(seed=seed)
         drawn = int(self.np_random.integers(2**31)) if seed is None else seed
         self.insertion.reset(drawn, self.level)
@@ -95,7 +96,7 @@ class InsertionEnvironment(gymnasium.Env[Any, NDArray[np.floating[Any]]]):
     def step(
         self, action: NDArray[np.floating[Any]]
     ) -> tuple[Readings, float, bool, bool, dict[str, Any]]:
-        """Carry out one tick of 0.1 s; the arm's limits bound an action beyond the space.
+        """Carry out one tick of 0.1 s; the arm's limits bound an action beyond the action space.
 
         Raises `ResetNeeded` before the first episode and after the end of one, and `ValueError` for
         an action that is not seven finite numbers.

@@ -1,10 +1,10 @@
 """The demonstrator: a hand that sees the target and the A-scan.
 
-It aligns over the target at limited speed while it descends to a standoff; it goes on down the
-slower, the farther it is from aligned; it punctures, and stops at the target layer. It waits by
-standing still, never by rising: a policy that imitates a demonstrator that rises in one place and
-sinks in another, and cannot tell the two apart, hovers. It acts on where the target was
-`REACTION_TICKS` ago, which the newest frames show.
+It aligns over the target at limited speed while it descends to a standoff. Then it descends
+further, more slowly the worse it is aligned, punctures, and stops at the target layer. It waits by
+standing still, never by rising: if it rose in one place and sank in another, a policy that imitates
+it and cannot tell the two places apart would hover. It acts on the target's place `REACTION_TICKS`
+ago, which the newest frames show.
 """
 
 from dataclasses import dataclass
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 REACTION_TICKS: Final = 1
 ALIGNED_MM: Final = 0.3
-"""Distance up to which the needle goes down at full speed; from `NOT_ALIGNED_MM` on it stops."""
+"""Up to this distance the needle descends at full speed; from `NOT_ALIGNED_MM` on it stops."""
 NOT_ALIGNED_MM: Final = 0.8
 STANDOFF_MM: Final = 1.4
 
@@ -30,9 +30,9 @@ _SMOOTHING = 0.5
 class Percept:
     """What the demonstrator knows when it acts.
 
-    `offset_mm` (2,) from needle to target; `distance_mm` from tip to surface and `layer_mm` from
-    tip to target layer; `inside` the tissue; `turn_deg` (3,) rotation vector to the upright;
-    `velocity` (6,) the arm's last motion, a tick.
+    `offset_mm` (2,) is from needle to target, `distance_mm` from tip to surface and `layer_mm` from
+    tip to target layer; `inside` is whether the tip is in the tissue, `turn_deg` (3,) the rotation
+    vector to the upright, and `velocity` (6,) the arm's motion in the last tick.
     """
 
     offset_mm: NDArray[np.float64]

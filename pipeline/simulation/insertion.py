@@ -1,25 +1,25 @@
-"""The physics of a simulated needle insertion, one step a control tick.
+"""The physics of a simulated needle insertion, one step for each control tick.
 
 A six-axis arm carries a needle over a soft phantom. A sticker on the phantom marks where to enter;
-a layer inside the phantom is where to stop. What is hidden where:
+a layer inside the phantom is where to stop. Each stream shows only a part of this:
 
-- The bench stands elsewhere in every episode, and the cameras stand with it: the arm's pose says
-  nothing about the target. Where the target lies sideways shows only in the images.
-- The cameras see nothing of heights (`Scene` holds none). How far the tissue and the layer are
-  shows only in the A-scan, and contact in the force.
+- The bench is at another place in every episode, and the cameras are fixed to it: the arm's pose
+  says nothing about the target. Only the images show the target's sideways position.
+- The cameras show no heights (`Scene` has none). Only the A-scan shows the distances to tissue and
+  layer, and only the force shows contact.
 - The phantom breathes. At level `moved` it is also pushed aside and up or down at random times, as
-  a patient moves, as long as the needle is clear of it: motion so far does not tell motion to come.
+  a patient moves, but only while the needle is clear of it: past motion does not predict the next.
 
-An action adds to the setpoint that the arm is commanded to, not to where it is: the arm follows
-with a lag, at limited speed and acceleration (`arm.ArmMotion`).
+An action is added to the commanded setpoint of the arm, not to the arm's pose: the arm follows with
+a lag, at limited speed and acceleration (`arm.ArmMotion`).
 
 Mechanics along the needle (vertical; leans are small): tissue is a stiffening spring,
 f = k1·u + k2·u² for an indentation u, until it is punctured at a set force; the surface then
 springs back around the needle, and f = cutting + friction·depth, as in A. M. Okamura, C. Simone,
 M. D. O'Leary, "Force modeling for needle insertion into soft tissue", IEEE TBME 51(10), 2004.
-A needle inside is held where it entered: pulled sideways it meets a spring, which also presses it
-against its channel and so adds friction along it. Pushes that are due while the needle is near or
-inside do not happen; bending is not modelled.
+A needle inside is held where it entered: a sideways pull meets a spring, which also presses the
+needle against its channel and so adds friction along it. Pushes that are due while the needle is
+near or inside do not happen; bending is not modelled.
 
 Between ticks target and surface move in straight lines. Units: mm, degrees, N, s. `bench` frame:
 the base frame moved sideways to the bench.
@@ -48,13 +48,13 @@ ENCODER_NOISE: Final = 0.002
 """Standard deviation of every joint and pose reading, mm and degrees."""
 
 MISS_MM: Final = 1.0
-"""Largest distance from the target to the puncture, sideways."""
+"""Largest sideways distance from the target to the puncture."""
 AT_LAYER_MM: Final = 0.15
 """Largest distance from the layer to a tip that counts as resting at it."""
 HOLD_TICKS: Final = 6
 """Ticks for which the tip has to rest at the layer."""
 OVERSHOOT_MM: Final = 0.5
-"""Farthest that the tip may go beyond the layer."""
+"""Largest distance that the tip may go beyond the layer."""
 FORCE_LIMIT_N: Final = 2.5
 """Largest force on the needle."""
 MAX_TICKS: Final = 120
@@ -64,14 +64,15 @@ _PUSH_TICKS = 2
 _CLEAR_MM = 1.1
 """The phantom is pushed only while the tip is farther away than this."""
 _SIDEWAYS_N_MM, _SIDEWAYS_FRICTION = 0.8, 0.3
-"""Spring that holds a needle 1 mm or more inside, and friction along it from that force."""
+"""Spring that holds a needle 1 mm or more inside, and the friction that its force causes."""
 
 
 @dataclass(frozen=True)
 class Scene:
     """Everything that the cameras see, in the bench frame: no heights.
 
-    `needle_mm` (2,) the tip, `lean_mm` (2,) how far the hub stands beside it, `target_mm` (2,).
+    `needle_mm` (2,) is the tip, `lean_mm` (2,) the hub's sideways distance from it, `target_mm`
+    (2,) the target.
     """
 
     needle_mm: NDArray[np.float64]
@@ -84,9 +85,10 @@ class Scene:
 class Knot:
     """Where everything is at the end of a tick.
 
-    `motion` is how the arm came there; `pose` (6,) in the base frame, its angles not wrapped;
-    `target_mm` (2,) in the bench frame; `surface_mm` the height of the undisturbed surface in the
-    base frame; `layer_mm` from the tip to the layer and `force_n` the largest force of the tick.
+    `motion` is the arm's motion during the tick; `pose` (6,) is in the base frame, its angles not
+    wrapped; `target_mm` (2,) is in the bench frame; `surface_mm` is the height of the undisturbed
+    surface in the base frame; `layer_mm` is from the tip to the layer, and `force_n` is the largest
+    force of the tick.
     """
 
     motion: ArmMotion
@@ -102,7 +104,7 @@ class Progress:
     """What decides whether an episode succeeds, fails or goes on."""
 
     puncture_mm: NDArray[np.float64] | None = None
-    """(2,) from the target to the tip, sideways, when the surface was last punctured."""
+    """(2,) sideways from the target to the tip, when the surface was last punctured."""
     overshoot_mm: float = 0.0
     max_force_n: float = 0.0
     held_ticks: int = 0
@@ -128,12 +130,12 @@ TIME_IS_UP: Final = "time is up"
 
 @dataclass(frozen=True)
 class InsertionTrace:
-    """The course of an insertion, one row a tick.
+    """The course of an insertion, one row for each tick.
 
-    `time_s` (tick,); `offset_mm` (tick, 2) from the target to the tip, sideways; `lateral_mm` (2,)
-    that at the puncture, without one at the end; `height_mm`
-    (tick,) of the tip above the surface at rest, negative inside; `layer_mm` (tick,) from the tip
-    to the target layer, negative beyond it; `force_n` (tick,) the largest within the tick.
+    `time_s` (tick,). `offset_mm` (tick, 2) is sideways from the target to the tip; `lateral_mm`
+    (2,) is the offset at the puncture, or at the end without one. `height_mm` (tick,) is of the tip
+    above the surface at rest, negative inside. `layer_mm` (tick,) is from the tip to the target
+    layer, negative beyond it. `force_n` (tick,) is the largest within the tick.
     """
 
     time_s: NDArray[np.float64]
@@ -162,7 +164,7 @@ class NeedleInsertion:
         self.action_rotation: ActionRotation = action_rotation
 
     def reset(self, seed: int, level: Level = "full") -> None:
-        """Begin the episode that this seed draws."""
+        """Begin the episode of this seed."""
         self.start(draw_layout(seed, level))
 
     def start(self, layout: InsertionLayout) -> None:
@@ -196,8 +198,8 @@ class NeedleInsertion:
     def step(self, action: NDArray[np.float64]) -> None:
         """Carry out one tick: dx dy dz (mm, base frame), rotation (deg), gripper (ignored).
 
-        It is added to the commanded setpoint, which the arm follows. Raises `ValueError` for an
-        action that is not seven finite numbers.
+        The action is added to the commanded setpoint, which the arm follows. Raises `ValueError`
+        for an action that is not seven finite numbers.
         """
         if np.shape(action) != (7,) or not np.isfinite(action).all():
             raise ValueError(f"action: expected 7 finite numbers, found {action}")
@@ -283,7 +285,7 @@ class NeedleInsertion:
         return np.append(motion, 1.0)
 
     def _pushed(self, now: Knot) -> tuple[NDArray[np.float64], float]:
-        """Where target and surface are a tick from now."""
+        """The target and the height of the surface a tick from now."""
         layout, breath = self.layout, self.layout.breath_mm(self.time_s + TICK_S)
         calm = now.surface_mm - layout.breath_mm(self.time_s)
         clear = not self.inside and now.pose[2] - now.surface_mm > _CLEAR_MM
@@ -301,9 +303,9 @@ class NeedleInsertion:
     def _meet(
         self, before: Knot, motion: ArmMotion, target_mm: NDArray[np.float64], surface_mm: float
     ) -> tuple[NeedleContact, NDArray[np.float64]]:
-        """Needle and tissue over one tick, and the poses at its readings.
+        """The contact of needle and tissue over one tick, and the poses at its readings.
 
-        Also settles whether the tip is now inside, where it entered, and all force on it.
+        It also decides whether the tip is now inside, where it entered, and the force on it.
         """
         part = np.arange(1, READINGS_PER_TICK + 1) / READINGS_PER_TICK
         path = motion.at(part * TICK_S)
@@ -323,7 +325,7 @@ class NeedleInsertion:
         drag = tissue.drag_n(depth) + _SIDEWAYS_FRICTION * sideways
         contact = NeedleContact(
             distance_mm=np.maximum(-depth, 0),
-            # A surface that gives way carries the layer along, until it is punctured.
+            # An indented surface moves the layer along, until it is punctured.
             layer_mm=tissue.layer_depth_mm - np.where(inside, depth, np.minimum(depth, 0)),
             inside=inside,
             force_n=np.where(inside, drag, spring),

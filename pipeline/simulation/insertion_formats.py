@@ -28,7 +28,7 @@ from pipeline.simulation.rendering import JPEG_QUALITY, VIEWS
 
 INSTRUCTION: Final = "Insert the needle at the red point"
 ABUTTING, OVERLAPPING = (65, 65), (650, 130)
-"""Readings in a window of the new format, and from one window to the next."""
+"""Readings in a window of the new format, and readings from one window's start to the next."""
 
 _CAMERAS: Final = {
     "View1": "zed_41182735_left",
@@ -65,7 +65,7 @@ def write_new(
 ) -> None:
     """Write `episode_<stamp>/`: sensor windows (length, stride), no actions.
 
-    Without `robot_clock` the robot's rows have no times but the metadata's.
+    Without `robot_clock` the robot's rows have no times of their own, only the metadata's.
     """
     folder = task / f"episode_{episode.stamp}"
     folder.mkdir(parents=True)
@@ -106,7 +106,7 @@ def write_new(
 def write_old(task: Path, episode: SimulatedEpisode) -> None:
     """Write `recv_all_<stamp>/`: actions and sensor at 10 Hz in a pickle, without a clock."""
     folder = task / f"recv_all_{episode.stamp}"
-    # Rows count from the earliest frame's name, so the first camera begins in time with them.
+    # Rows count from the time in the earliest frame's name, so the first camera begins with them.
     start = float(np.ceil(episode.epoch_s * 1000)) / 1000
     late = start - episode.epoch_s
     images: dict[str, list[str]] = {}

@@ -1,6 +1,6 @@
 """The hidden parameters of an episode, and how they are drawn.
 
-Each group draws from its own generator, so that a change of one leaves the others as they were.
+Each group draws from its own generator, so a change of one group does not change the others.
 """
 
 import math
@@ -15,14 +15,14 @@ from pipeline.data.timeline import wrapped_deg
 from pipeline.simulation.arm import NOMINAL_POSE, angles_deg, orientation
 
 WORKSPACE_MM: Final = np.array([6.5, 4.0])
-"""Needle and target begin within plus or minus this of the bench's middle, x and y."""
+"""Needle and target begin at most this far from the bench's middle, in x and y."""
 
 _ABOVE_MM = 0.3
 _PUSHES = 3
 _PUSH_MM: Final = (3.0, 8.0)
 _PUSH_EVERY_S: Final = (0.7, 1.4)
 _TISSUE: Final = ((0.9, 1.3), (0.5, 0.9), (0.9, 1.3), (0.2, 0.3), (0.1, 0.18), (2.0, 3.2))
-"""Bounds between which each field of `Tissue` is drawn, in their order."""
+"""Bounds between which each field of `Tissue` is drawn, in the order of the fields."""
 
 
 @dataclass(frozen=True)
@@ -50,8 +50,9 @@ class InsertionLayout:
     """The hidden parameters of an episode.
 
     `bench_mm` (2,), `start_pose` (6,) and `surfaces_mm` (place,) are in the base frame,
-    `targets_mm` (place, 2) in the bench frame. The phantom begins at place 0 and goes to the next
-    at each push that happens. `upright_deg` (3,) are a b r of a needle that points straight down.
+    `targets_mm` (place, 2) in the bench frame. The phantom begins at place 0 and moves to the next
+    place at each push that happens. `upright_deg` (3,) are a b r of a needle that points straight
+    down.
     """
 
     seed: int
@@ -113,7 +114,7 @@ def _targets(rng: np.random.Generator) -> NDArray[np.float64]:
 
 
 def _bounded_walk(rises: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Heights after each rise, each turned around where it would lead farther than 1.5 mm."""
+    """Heights after each rise; a rise that would lead farther than 1.5 mm is reversed."""
     heights: list[float] = []
     height = 0.0
     for rise in rises:
@@ -130,6 +131,6 @@ def _orientations(
     lean = orientation(np.zeros(3)).from_rotvec([*lean_deg, 0.0], degrees=True)
     turn = wrapped_deg(angles_deg(lean * orientation(upright)) - upright)
     if crosses_180:
-        # Spin about the needle adds to r alone: start half the turn before 180°, end half after.
+        # Spin about the needle changes only r: start half the turn before 180°, end half after.
         upright[2] = 180.0 - turn[2] / 2
     return upright, upright + turn

@@ -1,12 +1,12 @@
 """The needle's sensor: the force along it, and an OCT A-scan ahead of its tip.
 
 An A-scan is 1,025 bins of 5 µm, counted from the tip, in whole counts of an 8-bit digitiser.
-Outside the tissue nothing is brighter than its surface, a peak at the tip-to-tissue distance, with
-light scattered behind it that decays exponentially; inside, the scatter begins at the tip. The
-target layer is a second, weaker peak, which saturates as the surface does where speckle is bright.
-Beyond the last bin nothing is seen.
+Outside the tissue nothing is brighter than its surface, a peak at the tip-to-tissue distance; the
+light scattered behind it decays exponentially. Inside, the scatter begins at the tip. The target
+layer is a second, weaker peak; where speckle is bright it saturates, as the surface does. Beyond
+the last bin nothing is seen.
 
-Scattered light carries speckle, a grain that is fixed to the tissue and drawn anew for each episode
+Scattered light carries speckle, a grain that is fixed to the tissue and drawn for each episode
 (Schmitt, Xiang, Yung, "Speckle in optical coherence tomography", J. Biomed. Opt. 4(1), 1999). The
 gain drifts, the digitiser saturates, scans come late, and some are lost: then the last scan is
 repeated.
@@ -27,7 +27,7 @@ READINGS_PER_SCAN: Final = 5
 BIN_MM: Final = 0.005
 A_SCAN_BINS: Final = ALINE_BINS
 SCANS_LATE: Final = 2
-"""Scans that are under way in the spectrometer: 15 ms."""
+"""The number of scans that are still in the spectrometer: a delay of 15 ms."""
 
 _LOST_SCANS = 0.02
 _BACKGROUND, _NOISE = 20.0, 0.35
@@ -41,10 +41,10 @@ _OFFSETS: Final = np.arange(-_ORIGIN, 2 * A_SCAN_BINS + 1)
 
 @dataclass(frozen=True)
 class NeedleContact:
-    """Where the needle is relative to the tissue, one row a reading.
+    """Where the needle is relative to the tissue, one row for each reading.
 
-    `distance_mm` from the tip to the surface, 0 in contact; `layer_mm` from the tip to the target
-    layer; `inside` whether the surface is punctured; `force_n` along the needle.
+    `distance_mm` is from the tip to the surface, 0 in contact; `layer_mm` is from the tip to the
+    target layer; `inside` is whether the surface is punctured; `force_n` is along the needle.
     """
 
     distance_mm: NDArray[np.float64]
@@ -54,7 +54,7 @@ class NeedleContact:
 
 
 class NeedleSensor:
-    """The sensor of one episode: its gain, its tissue's speckle, and the scans under way."""
+    """The sensor of one episode: its gain, its tissue's speckle, and the delayed scans."""
 
     def __init__(self, gain: float, seed: int) -> None:
         rng = np.random.default_rng([seed, 103])
@@ -73,9 +73,9 @@ class NeedleSensor:
         seen = NeedleContact(*(values[fresh] for values in vars(contact).values()))
         time = start_s + np.arange(len(contact.force_n)) / READING_HZ
         taken = self.a_scans(seen, time[fresh], rng)
-        if self._under_way is None:  # before the episode the needle hung where it begins
+        if self._under_way is None:  # before the episode the needle hung at its first pose
             self._under_way = np.repeat(taken[:1], SCANS_LATE + 1, axis=0)
-        # The first of those under way was read last, and is repeated should the next be lost.
+        # The first of the delayed scans was read last; it is repeated if the next one is lost.
         scans = np.concatenate([self._under_way, taken])
         arrived = np.where(rng.random(len(taken)) < _LOST_SCANS, 0, np.arange(1, len(taken) + 1))
         shown = scans[np.maximum.accumulate(arrived)]
@@ -103,7 +103,7 @@ class NeedleSensor:
             * (scattered + outside * _SURFACE[surface])
         )
         noise = rng.standard_normal(signal.shape, np.float32) * np.float32(_NOISE)
-        # Rounded apart, rows of a still needle differ in few bins and compress.
+        # Rounded separately, rows of a still needle differ in few bins and compress.
         return np.clip(np.rint(_BACKGROUND + signal) + np.rint(noise), 0, 255, dtype=np.float32)
 
 
@@ -113,7 +113,7 @@ def distance_bin(distance_mm: NDArray[np.float64]) -> NDArray[np.int64]:
 
 
 def _scans_of(table: NDArray[np.floating[Any]]) -> NDArray[np.float32]:
-    """(start, 1025) every stretch of a table that a scan may see, without a copy."""
+    """(start, 1025) every part of a table that a scan may show, without a copy."""
     return sliding_window_view(table.astype(np.float32), A_SCAN_BINS)
 
 

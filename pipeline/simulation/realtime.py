@@ -1,9 +1,9 @@
-"""The simulated arm in real time: a tick of the simulation an action, cameras on their own thread.
+"""The simulated arm in real time: one simulated tick for each action, cameras on their own thread.
 
-The simulation has ticks of 0.1 s only. At another rate its world goes faster than life: at 100 Hz
-ten simulated seconds pass in a real one. The robot gives all times in real seconds, so its clock
-keeps pace with the monotonic one: readings that are 1.5 ms apart in the simulation are then 0.15 ms
-apart.
+The simulation has ticks of 0.1 s only. At a higher rate its world is faster than the real one: at
+100 Hz, ten simulated seconds pass in a real one. The robot gives all times in real seconds, so its
+clock keeps pace with the monotonic one: readings that are 1.5 ms apart in the simulation are then
+0.15 ms apart.
 """
 
 import math
@@ -21,15 +21,15 @@ from pipeline.simulation.recorder import CAMERA_HZ
 
 _STREAMS = ("state", "sensor")
 _FRAME_S = 0.9 / CAMERA_HZ
-"""Least time between two frames, however fast the world goes: each costs 6 ms."""
+"""Least time between two frames, however fast the simulation is: each frame takes 6 ms."""
 
 
 class SimulatedRobot:
     """One needle insertion as a robot that keeps pace with a clock.
 
     In ticks without an action the arm stands still. Once the episode is over, `observe` says how it
-    `ended`. Ticks pass by `clock`, in s; the cameras are a thread, by the machine's time: close the
-    robot to end it.
+    `ended`. Ticks follow `clock`, in s; the cameras run in a thread, by the machine's time: close
+    the robot to end it.
     """
 
     def __init__(
@@ -48,7 +48,7 @@ class SimulatedRobot:
 
     @property
     def outcome(self) -> str | None:
-        """How the episode ended; None where it goes on."""
+        """How the episode ended; None while it goes on."""
         return self._environment.insertion.outcome
 
     def observe(self) -> dict[str, Any]:
@@ -56,7 +56,7 @@ class SimulatedRobot:
         now = self._clock()
         if math.isnan(self._began_s):
             self._began_s = now
-        # A tick that begins a little early is not yet over: only whole ones were left out.
+        # A tick that begins a little early must not count as left out: only whole ticks do.
         due = math.floor((now - self._began_s) * self._hz + 0.05)
         while self._steps < due and self.outcome is None:
             self._step(np.zeros(7))
@@ -64,7 +64,7 @@ class SimulatedRobot:
         for name in _STREAMS if self._unread else ():
             observed[name] = np.concatenate([part[name] for part in self._unread])
             times = np.concatenate([part[f"{name}_time"] for part in self._unread])
-            observed[f"{name}_time"] = self._told_s(times)
+            observed[f"{name}_time"] = self._robot_time_s(times)
         self._unread = []
         if self.outcome is not None:
             observed["ended"] = self.outcome
@@ -103,8 +103,8 @@ class SimulatedRobot:
 
     def _taken(self) -> Shots:
         frames = self._environment.frames().items()
-        return {view: (self._told_s(taken_s), frame) for view, (taken_s, frame) in frames}
+        return {view: (self._robot_time_s(taken_s), frame) for view, (taken_s, frame) in frames}
 
-    def _told_s(self, time_s: Any) -> Any:
-        """Times of the episode on the robot's clock, on which its first tick ends at 0."""
+    def _robot_time_s(self, time_s: Any) -> Any:
+        """Converts times of the episode to the robot's clock, on which its first tick ends at 0."""
         return self._scale * (time_s - TICK_S)

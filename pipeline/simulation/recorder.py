@@ -29,7 +29,7 @@ _START_MM = (1.8, 5.0)
 _NOISE_MM, _NOISE_DEG = 0.02, 0.02
 """Standard deviation of the noise of every tick's motion, in every direction."""
 _NUDGES, _NUDGE_MM = 4, (0.3, 1.2)
-"""Number of nudges of the phantom in a demonstration, beside its pushes, and bounds of the
+"""Number of nudges of the phantom in a demonstration, in addition to its pushes, and bounds of the
 distance by which a nudge moves the target."""
 
 
@@ -37,7 +37,7 @@ distance by which a nudge moves the target."""
 class SimulatedEpisode:
     """One finished episode that began at `epoch_s`, and the generator of its clocks' jitter.
 
-    `sensor` (reading, 1026) at 650 Hz, the first a reading's time after the beginning.
+    `sensor` (reading, 1026) is at 650 Hz; the first reading is 1/650 s after the beginning.
     """
 
     insertion: NeedleInsertion
@@ -52,12 +52,12 @@ class SimulatedEpisode:
 
     @property
     def stamp(self) -> str:
-        """The beginning as recorders write it into names, UTC."""
+        """The beginning in UTC, in the form that recorders use in names."""
         return datetime.fromtimestamp(self.epoch_s, UTC).strftime("%Y%m%d_%H%M%S")
 
     @cached_property
     def sensor_time(self) -> NDArray[np.float64]:
-        """The sensor's jittered clock, one time a row of `sensor`."""
+        """The sensor's jittered clock, one time for each row of `sensor`."""
         nominal = self.epoch_s + np.arange(1, len(self.sensor) + 1) / READING_HZ
         return _jittered(nominal, _SENSOR_JITTER_S, self.rng)
 
@@ -93,12 +93,12 @@ class SimulatedEpisode:
 
 
 def simulate_episode(seed: int, epoch_s: float, crosses_180: bool = False) -> SimulatedEpisode:
-    """A demonstration that succeeds, of this seed or the next that does.
+    """A demonstration that succeeds, of this seed or of the next seed with one.
 
     Disturbances of the demonstrator put recoveries into the data, as in Laskey et al. 2017, "DART:
     Noise Injection for Robust Imitation Learning". Actions come from poses, so the labels contain
-    what disturbs the arm: a little noise of mean 0 in every tick. Larger misses come from nudges of
-    the phantom, which leave the labels clean. The same arguments give the same episode.
+    what disturbs the arm: in every tick a little noise of mean 0. Larger misses come from nudges of
+    the phantom, which do not change the labels. The same arguments give the same episode.
     """
     insertion, rng = NeedleInsertion(), np.random.default_rng([seed, 202])
     layout = _nudged(draw_layout(seed, "moved", crosses_180), rng)

@@ -1,12 +1,12 @@
 """Three camera views of the bench, without perspective, so that they show no heights.
 
-    View1  from the side, across the diagonal: the camera rides up and down with the arm, and a
-           splash guard fixed to it hides what lies below the needle's tip. A laser plane
+    View1  from the side, across the diagonal: the camera moves up and down with the arm, and a
+           splash guard fixed to it hides everything below the needle's tip. A laser plane
            through the target draws a red stripe on the wall behind.
     View2  from above, fixed to the bench: the phantom, its sticker, and the needle held by its arm.
     View5  from the hand: the needle's tip stays in the middle of the image, the sticker moves.
 
-The lenses are telecentric: distance changes neither size nor place.
+The lenses are telecentric: distance changes neither the size nor the place of an object.
 """
 
 from functools import cache
@@ -24,7 +24,7 @@ WIDTH: Final = 224
 HEIGHT: Final = 126
 
 JPEG_QUALITY: Final = 75
-"""JPEG quality of the recorder's frames, which a policy sees."""
+"""JPEG quality of the recorder's frames; a policy sees these frames."""
 
 _NOISE = 2.0
 """Standard deviation of the noise of a pixel's level."""
@@ -61,7 +61,7 @@ def render(view: str, scene: Scene) -> NDArray[np.uint8]:
 
 
 def photograph(view: str, insertion: NeedleInsertion, time_s: float) -> NDArray[np.uint8]:
-    """A camera's frame at a time of the episode so far: the image with the camera's noise.
+    """A camera's frame at a past time of the episode: the image with the camera's noise.
 
     The same episode, view and time give the same bits.
     """

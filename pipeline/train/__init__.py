@@ -1,5 +1,5 @@
-"""Training a policy: one loop for every expert, from a store or with a model in front that learns.
+"""Training a policy: one loop for every expert, on features of a store or of a model that learns.
 
-A run goes on from every checkpoint, on one process or on several of torchrun. This package imports
-nothing: most modules import torch, which the check for a finished run does without.
+A run can resume from every checkpoint, on one process or on several that torchrun starts. This file
+imports nothing: most modules import torch, and the check for a finished run must not.
 """

@@ -1,4 +1,4 @@
-"""Batches of a store on their way to a policy: what a batch is made of, and where it is gathered.
+"""The batches that a policy learns from: which ticks they have, and where they are gathered.
 
 `Prefetch` gathers ahead of time into a few reused buffers: a fresh output for every batch costs
 more in page faults than the gather itself, and a gather between two steps makes the device wait.
@@ -36,7 +36,7 @@ _DEVICE_SHARE = 0.6
 class Lags:
     """How late each stream is: `features` in whole VL rows, the others in seconds.
 
-    One number for all samples of a batch, or (batch,).
+    Each is one number for all samples of a batch, or (batch,).
     """
 
     features: Late = 0
@@ -66,15 +66,16 @@ def cut_batches(ticks: Ticks, batch_size: int) -> list[BatchIndices]:
 
 
 def evenly(ticks: Ticks, most: int) -> Ticks:
-    """These ticks, or `most` of them, evenly spaced."""
+    """At most `most` of these ticks, evenly spaced."""
     return ticks[np.linspace(0, len(ticks) - 1, min(len(ticks), most)).round().astype(np.int64)]
 
 
 @dataclass(frozen=True)
 class Windows:
-    """How much of each stream a sample sees: ticks, readings at most, and seconds before the tick.
+    """How much of each stream a sample sees: at most so many readings, none older than so long.
 
-    Seconds of None allow any age. The names are those of `FeatureStore.gather`.
+    `horizon` is the length of the action chunk in ticks. The windows count readings, or with `_s`
+    seconds before the tick; None seconds allow any age. `FeatureStore.gather` has the same names.
     """
 
     horizon: int
@@ -85,7 +86,7 @@ class Windows:
 
     @classmethod
     def of(cls, params: TrainHeadParams) -> Self:
-        """The windows of this policy; a single reading of a stream whose encoder is off."""
+        """The windows that `params` set; a stream whose encoder is off gets a single reading."""
         return cls(
             params.horizon,
             params.sensor_window if params.sensor_enabled else 1,
@@ -96,25 +97,25 @@ class Windows:
 
 
 class DeviceStore:
-    """The arrays of these wide fields of a store (`pipeline.store.gather.WIDE`) on a device.
+    """A copy on a device of the arrays of a store's wide fields (`pipeline.store.gather.WIDE`).
 
-    They are copied once, with a progress bar. The host works out the rows of a batch and sends only
-    a few small index tensors.
+    They are copied once, with a progress bar. For each batch the host computes the rows and sends
+    only a few small index tensors.
     """
 
     def __init__(self, store: FeatureStore, fields: Collection[str], device: torch.device) -> None:
         sources = {name: store.gatherer.tensor(name) for name in sorted(fields)}
         sources = {name: source for name, source in sources.items() if source.nbytes}
         self.fields = frozenset(sources)
-        """The fields that live there; a stream that the store lacks has none."""
+        """The fields on the device, without those of streams that the store lacks."""
         self._device = device
         bar = tqdm(sources.items(), f"store to {device}", unit="stream", disable=None)
         self._tensors = {name: source.to(device, copy=True) for name, source in bar}
 
     def complete(self, batch: Batch, selection: Selection) -> Batch:
-        """The batch with this store's fields, on the device; the other fields stay where they are.
+        """The batch with this store's fields gathered on the device; other fields do not move.
 
-        On CUDA it does not wait: the work joins the current stream.
+        On CUDA it returns without waiting: the work is queued on the current stream.
         """
         gathered: dict[str, Tensor] = {}
         for name in self.fields & selection.rows.keys():
@@ -129,7 +130,7 @@ class DeviceStore:
     def _window(
         self, readings: Shaped[Tensor, "reading channel"], window: Window, length: int
     ) -> Shaped[Tensor, "batch window channel"]:
-        """Zeros before the first real reading."""
+        """The windows of a batch, with zeros before the first real reading."""
         place = torch.arange(length, device=self._device)
         rows = (self._send(window.end)[:, None] + place - length).clamp_(min=0)
         values = readings.index_select(0, rows.view(-1)).view(*rows.shape, -1)
@@ -148,14 +149,14 @@ class DeviceStore:
 def choose_feed(
     feed: str, store: FeatureStore, device: torch.device, free: int | None = None
 ) -> tuple[frozenset[str], str]:
-    """Which wide fields of a batch live on the device, and a line that says why.
+    """Which wide fields of a batch to keep on the device, and a line that says why.
 
-    With `feed` "device" the streams that fit into `free` bytes there (measured if None), the
-    smallest first; with "auto" all of them on a GPU where all fit, else none.
+    With `feed` "device" these are the streams that fit into a share of its `free` bytes (measured
+    if None), the smallest first; with "auto" all of them if it is a GPU and all fit, else none.
     """
-    by = "auto" if feed == "auto" else "as train_head.feed says"
+    chosen_by = "auto" if feed == "auto" else "as train_head.feed says"
     if feed == "mapped":
-        return frozenset(), f"feed: mapped ({by})"
+        return frozenset(), f"feed: mapped ({chosen_by})"
     if feed == "auto" and device.type != "cuda":
         return frozenset(), f"feed: mapped (auto: training runs on the {device})"
     if free is None:
@@ -170,7 +171,7 @@ def choose_feed(
     )
     if feed == "auto" and len(fields) < len(wide):
         return frozenset(), f"feed: mapped (auto: {room})"
-    return frozenset(fields), f"feed: device ({by}; {room})"
+    return frozenset(fields), f"feed: device ({chosen_by}; {room})"
 
 
 _Filled = tuple[BatchIndices, Batch, Selection]
@@ -178,23 +179,23 @@ _Filled = tuple[BatchIndices, Batch, Selection]
 
 @dataclass
 class _Buffer:
-    """A reused host batch, and the copy out of it that must end before the next is filled in."""
+    """A reused host batch, and its copy to the device, which must end before it is refilled."""
 
     batch: Batch | None = None
     copied: torch.cuda.Event | None = None
 
 
 class Prefetch(Iterator[tuple[BatchIndices, Batch]], AbstractContextManager["Prefetch"]):
-    """Hands out `(indices, batch)` for each entry of `plan`, in its order.
+    """Yields `(indices, batch)` for each entry of `plan`, in its order.
 
-    The plan is consumed in a background thread, at most `buffers` batches ahead. On the CPU a
-    batch stays as it is until the next one is asked for; on CUDA it is a copy on the device, made
-    from pinned memory, that is never overwritten. An exception in the plan or in the store comes
-    out of `next` at the batch it belongs to. Use as a context manager, or call `close`. The thread
-    does not survive a fork: a forked process reads from the same store with a `Prefetch` it makes.
+    A background thread consumes the plan, at most `buffers` batches ahead. On the CPU a batch is
+    valid until the next one is requested; on CUDA it is a copy on the device, made from pinned
+    memory, that is never overwritten. `next` raises an exception of the plan or the store at the
+    batch it belongs to. Use it as a context manager, or call `close`. The thread does not survive
+    a fork: a forked process must make its own `Prefetch` on the same store.
 
-    Fields that `resident` holds are gathered on its device, into fresh memory; on CUDA when the
-    batch is handed out, in the order of the consumer's stream. The rest of the store is read into
+    The fields of `resident` are gathered on its device, into fresh memory; on CUDA this happens
+    when the batch is handed out, on the consumer's stream. The rest of the store is read into
     memory in the background, as far as it fits.
     """
 
@@ -260,7 +261,7 @@ class Prefetch(Iterator[tuple[BatchIndices, Batch]], AbstractContextManager["Pre
         self._coming.append((buffer, self._thread.submit(self._fill, buffer)))
 
     def _fill(self, buffer: _Buffer) -> _Filled | None:
-        """The next batch of the plan, without what lives on a GPU; None at the plan's end."""
+        """The next batch of the plan, without the fields on a GPU; None at the plan's end."""
         indices = next(self._plan, None)
         if indices is None:
             return None

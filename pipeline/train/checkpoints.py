@@ -1,4 +1,4 @@
-"""The trainer's state beside a policy, as safetensors and JSON: what it takes to resume a run."""
+"""The trainer's state beside a policy, as safetensors and JSON: all that resuming a run needs."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -28,7 +28,7 @@ class TrainerState(Document):
 
     step: Annotated[int, Field(ge=0)]
     columns: tuple[Text, ...]
-    """Of the history."""
+    """Column names of the history."""
     best_error: float | None
     stalled: Annotated[int, Field(ge=0)]
     """Evaluations since the best one."""
@@ -41,9 +41,9 @@ class TrainerState(Document):
 def write_trainer(folder: Path, state: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> None:
     """Write the two files of a trainer's state into an existing folder.
 
-    `state` has the fields of `TrainerState` but for the digest. `tensors` are the learning
-    parameters (`weights:<name in the trained module>`), the moving `average:` of each, the
-    `optimizer:` state and the `history:`, a row for every step so far.
+    `state` has the fields of `TrainerState` except the digest. `tensors` are the trainable
+    parameters (`weights:<name in the trained module>`), their moving averages (`average:`), the
+    optimizer's state (`optimizer:`), and a row for every step so far (`history:`).
     """
     digest = write_tensors(folder / TRAINER_WEIGHTS, tensors)
     write_with_digest(folder / TRAINER_DOCUMENT, {**state, "weights_sha256": digest})

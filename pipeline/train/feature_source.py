@@ -1,4 +1,4 @@
-"""Where the features of a training come from: the store, or a model that learns."""
+"""Where training gets its features: from the store, or from a model that learns."""
 
 from collections.abc import Collection, Iterable, Mapping
 from pathlib import Path
@@ -15,14 +15,14 @@ from pipeline.train.batches import BatchIndices, DeviceStore, Prefetch, Windows
 class FeatureSource:
     """Features from the store; only the policy is trained and saved.
 
-    A subclass puts a model before the policy. The wide fields of a batch that `on_device` names
-    live on the device; they are copied there with the first feed, once for all feeds.
+    A subclass puts a model before the policy. The wide fields that `on_device` names are kept on
+    the device; the first feed copies them there, once for all feeds.
     """
 
     identity: Mapping[str, Any] = {}
-    """JSON of what else decides the numbers of the run; empty where only the params do."""
+    """JSON of everything besides store and params that decides the run's numbers; may be empty."""
     eval_ticks: int | None = None
-    """Ticks of val evaluated at most during training; None: the trainer's own limit."""
+    """The most val ticks of an evaluation during training; None: the trainer's own limit."""
 
     def __init__(self, store: FeatureStore, on_device: Collection[str] = (), *notes: str) -> None:
         self.store = store
@@ -33,7 +33,7 @@ class FeatureSource:
 
     @property
     def golden(self) -> tuple[GoldenRow, ...]:
-        """The store's golden rows, by which a live model proves its features.
+        """The store's golden rows: a live model is checked against their features.
 
         Raises `StoreIncomplete` where one is damaged.
         """
@@ -44,21 +44,21 @@ class FeatureSource:
         return policy
 
     def policy_of(self, module: Trainable) -> Policy:
-        """The policy within a module of `attach`, or within a copy of one."""
+        """The policy inside a module that `attach` returned, or inside a copy of it."""
         assert isinstance(module, Policy)
         return module
 
     def parameter_lr(self, name: str) -> float | None:
-        """The peak learning rate of a parameter of the module; None: that of `train_head`."""
+        """The peak learning rate of a parameter of the module; None: the rate of `train_head`."""
         return None
 
     def feed(
         self, plan: Iterable[BatchIndices], windows: Windows, device: torch.device
     ) -> Prefetch:
-        """The batches of a plan, in its order, as the module takes them."""
+        """The batches of a plan, in its order, in the form that the module takes."""
         if self._on_device and self._resident is None:
             self._resident = DeviceStore(self.store, self._on_device, device)
         return Prefetch(self.store, plan, windows, device, resident=self._resident)
 
     def save(self, folder: Path, module: Trainable) -> None:
-        """Write the files that stand beside the policy's in a checkpoint folder: none."""
+        """Write further files beside the policy's in a checkpoint folder; here there are none."""

@@ -1,4 +1,4 @@
-"""Groups of episodes: who has learnt from one episode of a group knows the others."""
+"""Groups of episodes so alike that a policy trained on one of them in effect knows the others."""
 
 from collections.abc import Hashable, Iterator, Mapping, Sequence
 from fnmatch import fnmatchcase
@@ -11,8 +11,8 @@ from pipeline.store import Episode, FeatureStore, episode_name
 
 _TOLERANCE, _RESTING = 1e-3, 0.1
 """How much two equal actions may differ in a channel, as a share of its range in the episode. A
-channel that rests while others move varies by rounding alone, so its range counts as at least a
-tenth of the widest."""
+channel at rest varies only by rounding, so its range counts as at least a tenth of the widest
+channel's."""
 
 
 def episodes_by_group(
@@ -22,16 +22,16 @@ def episodes_by_group(
 ) -> dict[str, list[Episode]]:
     """The episodes that have ticks, by group; a group is named by the first "source/id" in it.
 
-    Two episodes are of one group where their first VL keys, their files or their actions are equal,
-    where their recordings name the same group, where `patterns` (shell wildcards for "source/id",
-    by the name of a group) match both, and where both share a group with a third. Actions are equal
-    where two episodes of as many ticks agree within 0.1 % of their range, so that a copy encoded
-    again is recognised. Actions that never change are not compared. `keys` (vl_row, 16) replace the
-    store's own.
+    Two episodes share a group if their first VL keys, their files or their actions are equal, if
+    their recordings name the same group, if `patterns` (shell wildcards for "source/id", by group
+    name) of one group match both, or if both share a group with a third episode. Actions are equal
+    if the episodes have the same number of ticks and agree within 0.1 % of their range, so a
+    re-encoded copy is recognised. Actions that never change are not compared. `keys` (vl_row, 16)
+    replace the store's own.
 
-    Raises `ConfigError` where a pattern fits no episode.
+    Raises `ConfigError` if a pattern matches no episode.
     """
-    from scipy.cluster.hierarchy import DisjointSet  # a second, which a finished run does without
+    from scipy.cluster.hierarchy import DisjointSet  # slow to import, not needed when finished
 
     episodes = [episode for episode in store.episodes if len(episode.ticks)]
     keys = store.array("vl/key") if keys is None else keys
@@ -39,7 +39,7 @@ def episodes_by_group(
     together, first = DisjointSet(range(len(episodes))), dict[Hashable, int]()
     for index, episode in enumerate(episodes):
         row = episode.vl_rows.start
-        # The key of a row without a frame only tells the instruction.
+        # Without a frame, a row's key depends on the instruction alone.
         key = keys[row].tobytes() if np.isfinite(frame_time[row]).any() else b""
         marks = [("key", key), ("content", episode.content), ("group", episode.group)]
         for mark in (mark for mark in marks if mark[1]):
@@ -55,7 +55,7 @@ def episodes_by_group(
 def _fitting(
     patterns: Mapping[str, Sequence[str]], names: Sequence[str]
 ) -> Iterator[tuple[str, int]]:
-    """(group, place) of each name that a pattern of the group matches."""
+    """Yields (group, index in `names`) for each name that a pattern of the group matches."""
     for group, wanted in patterns.items():
         for pattern in wanted:
             places = [i for i, name in enumerate(names) if fnmatchcase(name, pattern)]
@@ -71,7 +71,7 @@ def _fitting(
 def _equal_actions(
     action: NDArray[np.float32], episodes: Sequence[Episode]
 ) -> Iterator[tuple[int, int]]:
-    """Pairs of places among the episodes whose actions (tick, action) are equal."""
+    """Yields the indices in `episodes` of each pair with equal actions (tick, action)."""
     by_length: dict[int, list[int]] = {}
     for index, episode in enumerate(episodes):
         by_length.setdefault(len(episode.ticks), []).append(index)
@@ -80,7 +80,7 @@ def _equal_actions(
         ranges = np.stack([np.ptp(own, axis=0) for own in actions])
         widest = ranges.max(axis=1, keepdims=True)
         tolerance = _TOLERANCE * np.maximum(ranges, _RESTING * widest)
-        # Cheap to compare; equal actions have equal outlines.
+        # First, mean and last action: cheap to compare, and equal where the actions are equal.
         outline = np.stack([[own[0], own.mean(axis=0, dtype=float), own[-1]] for own in actions])
         moving = np.flatnonzero((widest[:, 0] > 0) & (widest[:, 0] < np.inf))
         for rank, own in enumerate(moving):

@@ -1,7 +1,7 @@
 """What a run logs: the loss at every step, its curves and its speed.
 
-Every logger takes the same rows. Files of TensorBoard and Weights & Biases hold clock times, so
-they lie beside the logs, which DVC hashes, not in them.
+Every logger takes the same rows. DVC hashes the folder of logs, so the files of TensorBoard and
+Weights & Biases, which hold clock times, lie beside it.
 """
 
 import json
@@ -32,10 +32,11 @@ from pipeline.train.process_group import ProcessGroup
 from pipeline.train.progress import Pace
 
 FINISH_TIMEOUT_S = 120.0
-"""How long a finished run waits for Weights & Biases to take what it has not sent yet."""
+"""How long a finished run waits until Weights & Biases has sent its remaining rows."""
 _SPEED = "step\tsteps_per_s\tdata_wait_share\tpeak_memory_mib\ttrained_s"
 _MODULES = {"tensorboard": "torch.utils.tensorboard", "wandb": "wandb.sdk"}
-"""The module that proves a logger's package: the folder `wandb` that a run leaves has none."""
+"""The module whose import shows that a logger's package is installed. `import wandb` would not show
+it: it also takes a folder `wandb` that a run left behind."""
 
 Row = tuple[int, Mapping[str, float]]
 """A step, counted from 1, and metrics by name."""
@@ -101,13 +102,13 @@ class Logger(Protocol):
         """Add a point, at a step counted from 1, to each of these curves."""
 
     def close(self, finished: bool) -> None:
-        """End the log of a run that is finished, or was stopped and may be resumed."""
+        """End the log; if not `finished`, the run was stopped and may be resumed."""
 
 
 class CurveFiles:
     """Curves as DVC plots them: `plots/metrics/<name>.tsv`, the newest values in `metrics.json`.
 
-    The files are those of dvclive. dvclive itself fails in a repository without a commit and runs
+    The files have dvclive's format. dvclive itself fails in a repository without a commit and runs
     `dvc init` in one that does not use DVC.
     """
 
@@ -142,11 +143,11 @@ class CurveFiles:
 
 
 class TensorBoard:
-    """Event files in `folder`, of which the newest holds the whole run.
+    """TensorBoard's event files in `folder`; the newest file holds the whole run.
 
     `TrainingLog` writes the earlier rows again after a stop, so each start tells TensorBoard to
-    forget the files before it (`purge_step`): no step appears twice. The files stay, because a
-    running TensorBoard would wait for ever for one that is gone.
+    forget the older files (`purge_step`): no step appears twice. Those files are not deleted,
+    because a running TensorBoard would wait for ever for a deleted file.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -156,12 +157,12 @@ class TensorBoard:
         self._writer = SummaryWriter(str(folder), purge_step=0, flush_secs=10)
 
     def write(self, step: int, metrics: Mapping[str, float]) -> None:
-        """Add a scalar of each."""
+        """Add a scalar for each metric."""
         for name, value in metrics.items():
             self._writer.add_scalar(name, value, step)
 
     def close(self, finished: bool) -> None:
-        """Write what is buffered."""
+        """Write the buffered points."""
         self._writer.close()
 
 
@@ -198,13 +199,13 @@ class WandB:
                 "later), or take wandb out of train_head.loggers."
             ) from None
         self._from = self._run.starting_step
-        if self._run.offline:  # whose `url` warns
+        if self._run.offline:  # the `url` of an offline run prints a warning
             self.note = f"wandb is offline; wandb sync {self._run.settings.sync_dir} sends the run"
         else:
             self.note = f"live: {self._run.url}"
 
     def write(self, step: int, metrics: Mapping[str, float]) -> None:
-        """Send a point of each, unless the service has it from before a stop."""
+        """Send a point of each curve, unless the service received it before a stop."""
         if step >= self._from:
             self._run.log(dict(metrics), step=step)
 
@@ -251,7 +252,7 @@ def open_loggers(params: TrainHeadParams, resumed: bool) -> list[Logger]:
 
 
 def _beside(logs: Path, name: str) -> Path:
-    """A place beside the logs, for what holds clock times: DVC hashes the logs."""
+    """A path beside the logs, for files with clock times: DVC hashes the logs."""
     return logs.with_name(f"{logs.name}.{name}")
 
 
@@ -263,8 +264,8 @@ def speed_file(logs: Path) -> Path:
 class TrainingLog(AbstractContextManager["TrainingLog"]):
     """Writes the same rows to every logger, and keeps them.
 
-    Rows from before a stop come as `earlier` and are written again: DVC may have deleted the folder
-    since, and a killed run has logged steps beyond its last checkpoint. Speed and memory since the
+    The rows from before a stop, `earlier`, are written again: DVC may have deleted the folder since
+    then, and a killed run has logged steps beyond its last checkpoint. Speed and memory since the
     last start go to `speed_file`, so that the folder, which DVC tracks, holds no clock time. Raises
     `DiskFull`.
     """
@@ -312,7 +313,7 @@ def open_log(
 ) -> Generator[TrainingLog | None]:
     """The log with the loggers of `params` on rank 0, which prints where to look; None elsewhere.
 
-    Where it cannot begin, all processes end. Raises `ConfigError` or `DiskFull`.
+    If it cannot begin, all processes end. Raises `ConfigError` or `DiskFull`.
     """
     opened: list[TrainingLog] = []
     with ExitStack() as stack:

@@ -47,17 +47,17 @@ from pipeline.train.training_data import source_of, split_parts
 
 LOG_EVERY = 10
 EVALUATION_TICKS = 1000
-"""Ticks of val evaluated during training at most, evenly spaced; `stages.evaluate` takes all."""
+"""The most val ticks, evenly spaced, of an evaluation in training; `stages.evaluate` uses all."""
 
 
 class Trainer:
-    """A policy in training, begun anew or resumed from the run's last checkpoint.
+    """Trains a policy, from the start or from the run's last checkpoint.
 
-    A step (its ticks, dropout, noise and learning rate) follows from the seed and its number alone.
-    So a run that was stopped at any checkpoint continues to the same losses and weights, bit for
-    bit on a CPU with as many threads. N processes follow the curve of one that accumulates N times
-    as much, within float noise. Within a `process_group` every process makes a trainer, and all
-    call the same methods.
+    The seed and the step's number alone decide its ticks, dropout, noise and learning rate. So a
+    run that was stopped at any checkpoint continues to the same losses and weights, bit for bit on
+    a CPU with the same number of threads. N processes give the same curve, within float noise, as
+    one process that accumulates N times as much. In a `process_group` every process makes a
+    trainer, and all call the same methods.
     """
 
     def __init__(
@@ -96,7 +96,7 @@ class Trainer:
             self.stopping.best_error, self.stopping.stalled = state.best_error, state.stalled
             self.step, self._earlier, self._trained_s = state.step, state.rows, state.trained_s
         else:
-            # The state's encoder sees its own window, whatever else is gathered to anchor.
+            # Statistics are of the state encoder's own window; anchoring may gather a longer one.
             readings = min(params.state_window, self.windows.state_window)
             own = {"state_window": readings, "state_window_s": params.state_window_s}
             fitted = partial(fit_normalization, store, split.train, replace(self.windows, **own))
@@ -106,7 +106,7 @@ class Trainer:
             self._build()
 
     def _build(self) -> None:
-        """Build the policy behind its features, its optimizer and the average of what learns.
+        """Build the module that is trained, its optimizer and the average of its weights.
 
         All processes begin with the weights of rank 0 and stay equal.
         """
@@ -140,8 +140,8 @@ class Trainer:
         """Train to the last step or to an early stop, and finish the run.
 
         Raises `NumericsError` on a loss or gradient that is not finite, naming the step and its
-        ticks. On Ctrl-C or SIGTERM to any process, all end the step, write the last checkpoint and
-        raise `KeyboardInterrupt`.
+        ticks. On Ctrl-C or SIGTERM to any process, all of them finish the step, write the last
+        checkpoint and raise `KeyboardInterrupt`.
         """
         steps, shown = range(self.step, self.params.max_steps), self.processes.first
         resumed = self.run.status == "resumed"
@@ -204,7 +204,7 @@ class Trainer:
     def _train_step(
         self, batches: Iterator[tuple[BatchIndices, Batch]], interrupted: Callable[[], bool]
     ) -> bool:
-        """Take one step with all processes; whether one of them was interrupted."""
+        """Take one step with all processes; returns whether one of them was interrupted."""
         scalars, stopped = self.learn(islice(batches, len(self.plan.own)), interrupted)
         self.history.add(scalars)
         self.step += 1
@@ -213,7 +213,7 @@ class Trainer:
     def learn(
         self, parts: Iterable[tuple[BatchIndices, Batch]], interrupted: Callable[[], bool]
     ) -> tuple[dict[str, Tensor], bool]:
-        """Learn from this process's parts of the batch of the next step.
+        """Learn from this process's parts of the next step's batch.
 
         Returns the loss, the norm of the gradient and the loss's parts, detached and over all
         processes, and whether any process was interrupted.
@@ -236,7 +236,7 @@ class Trainer:
     def _backward(self, part: BatchIndices, batch: Batch) -> dict[str, Tensor]:
         """Add a part's gradients; returns its loss and the loss's parts, times its share."""
         assert isinstance(part, StepPart), "a feed hands back the entries of its plan"
-        # So dropout and sampled noise of a part depend on no part before it.
+        # A part's dropout and sampled noise must not depend on the parts before it.
         torch.manual_seed(part.seed)
         action, valid = batch.action, batch.action_valid
         if self.params.terminal_stop:
@@ -375,10 +375,10 @@ def stand_still(
     valid: Bool[Tensor, "batch horizon"],
     moves: Bool[Tensor, " action"],
 ) -> tuple[Float[Tensor, "batch horizon action"], Bool[Tensor, "batch horizon"]]:
-    """The chunk with a standstill beyond the episode's end, and the mask of valid steps: all.
+    """The chunks with a standstill beyond the episode's end, and their mask: every step is valid.
 
-    Channels that `moves` marks (deltas and velocities) become 0 there. Positions, such as a
-    gripper's, repeat the last one, as the store has it.
+    There, channels that `moves` marks (deltas and velocities) become 0. Positions, such as a
+    gripper's, repeat the last one, as in the store.
     """
     return action.masked_fill(~valid.unsqueeze(-1) & moves, 0.0), torch.ones_like(valid)
 
@@ -393,7 +393,7 @@ class EarlyStopping:
     stalled: int = 0
 
     def take(self, error: float) -> bool:
-        """Count the error of an evaluation; whether it is the best so far."""
+        """Count the error of an evaluation; returns whether it is the best so far."""
         better = self.best_error is None or error < self.best_error
         if better:
             self.best_error = error

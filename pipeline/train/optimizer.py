@@ -1,4 +1,4 @@
-"""AdamW over what learns, its learning rates, the moving average of weights, torch.compile."""
+"""AdamW for the trainable parameters, its learning rates, the weight average and torch.compile."""
 
 import copy
 import math
@@ -75,7 +75,7 @@ def decay_groups(module: nn.Module) -> tuple[list[str], list[str]]:
 
 
 def schedule(step: int, params: TrainHeadParams) -> float:
-    """The share of its peak that every learning rate has at a step, counted from 0.
+    """Every learning rate at a step, counted from 0, as a share of its peak.
 
     A linear warm-up: the first step has 1 / warmup_steps, step warmup_steps has 1. Then `cosine`
     falls along half a cosine to min_lr_fraction at the last step (Loshchilov and Hutter, "SGDR",
@@ -151,14 +151,14 @@ class WeightAverage:
 
 
 def compiled(loss: Callable[..., Any], device: torch.device) -> Callable[..., Any]:
-    """The function, compiled at its first call, with the random numbers of eager torch.
+    """The function, compiled at its first call; it draws the same random numbers as eager torch.
 
     That call raises `ConfigError` where torch's code for the device (C++ for a CPU, Triton for a
     GPU) does not compile.
     """
     from torch._dynamo.exc import BackendCompilerFailed  # imported here: it takes a second
 
-    # Without it Inductor draws dropout and noise from a generator of its own.
+    # Without this option Inductor draws dropout and noise from a generator of its own.
     inner = torch.compile(loss, options={"fallback_random": True})
 
     def checked(*arguments: Any) -> Any:

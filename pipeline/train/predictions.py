@@ -1,4 +1,4 @@
-"""The actions of a policy at recorded ticks, beside the recorded ones."""
+"""A policy's actions at recorded ticks, beside the recorded actions."""
 
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import AbstractContextManager
@@ -21,13 +21,13 @@ Actions = NDArray[np.float32]
 FeedMaker = Callable[
     [Sequence[BatchIndices]], AbstractContextManager[Iterable[tuple[BatchIndices, Batch]]]
 ]
-"""Makes the feed of a plan: the batches that a policy sees at these ticks."""
+"""Makes the feed of a plan: the batches that a policy sees at its ticks."""
 Watch = Callable[[Actions, Actions, NDArray[np.bool_]], None]
 """Called with all chunks (sample, tick, horizon, action_dim) of a batch, the recorded chunks and
 their valid steps."""
 _SEED = 0
 _CHUNKS_AT_ONCE = 1024
-"""Chunks sampled in one forward pass at most, and at least one a tick: bounds the memory."""
+"""The most chunks sampled in one forward pass, to bound the memory; but at least one a tick."""
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ class Predictions:
     episodes: NDArray[np.int64]
     """(tick,) index of each tick's episode in the store."""
     predicted: Actions
-    """Of a policy that samples, its first sample, which a robot would execute."""
+    """A stochastic policy's first sample, which a robot would execute."""
     recorded: Actions
     valid: NDArray[np.bool_]
     sampled: Actions | None = None
@@ -66,18 +66,18 @@ def predict(
     feed: FeedMaker | None = None,
     watch: Watch | None = None,
 ) -> Predictions:
-    """The chunks of the policy, in evaluation mode, at these ticks, beside the recorded ones.
+    """The policy's chunks at these ticks, in evaluation mode, beside the recorded chunks.
 
-    A robot executes one sample, so errors are those of one sample: of a stochastic policy the mean
-    error over `samples` independent samples, never the error of their mean. Noise comes from one
-    generator of fixed seed, batch after batch: the same weights, ticks, `samples` and `batch_size`
-    give the same figures; another `batch_size` changes those of a stochastic policy. Runs on the
-    policy's device, on the batches of `feed`, by default the store's. `watch` is called with all
-    samples. `progress` shows a bar on a terminal. Raises `NumericsError`, naming episode, tick and
-    time, where a prediction or a recorded action is NaN or infinite.
+    A robot executes one sample, so a stochastic policy's error is the mean of the errors of
+    `samples` independent samples, never the error of their mean. One generator of fixed seed draws
+    the noise of all batches: the same weights, ticks, `samples` and `batch_size` give the same
+    figures; another `batch_size` changes those of a stochastic policy. Runs on the policy's device,
+    on the batches of `feed`, by default the store's. `watch` is called with all samples. `progress`
+    shows a bar on a terminal. Raises `NumericsError`, naming episode, tick and time, where a
+    prediction or a recorded action is NaN or infinite.
     """
     device = next(policy.parameters()).device
-    # On the CPU, so that every device is given the same noise.
+    # On the CPU, so that every device gets the same noise.
     generator = Generator().manual_seed(_SEED)
     plan = cut_batches(ticks, batch_size)
     predicted, recorded, valid, sampled = [], [], [], []
@@ -115,7 +115,7 @@ def predict(
 def _sample(
     policy: Trainable, batch: Batch, samples: int, generator: Generator
 ) -> Float[np.ndarray, "sample tick horizon action_dim"]:
-    """Independent chunks of each tick in float32; one where the policy does not sample."""
+    """Independent chunks of each tick in float32; a single one if the policy is not stochastic."""
     samples = samples if policy.stochastic else 1
     at_once = max(1, _CHUNKS_AT_ONCE // len(batch))
     parts = [

@@ -1,4 +1,4 @@
-"""The processes of one training, which is one alone or several of torchrun, and how they stop."""
+"""The processes of one training, a single one or several from torchrun, and how they stop."""
 
 import os
 import signal
@@ -25,7 +25,7 @@ evaluates. Nobody waits for a process that died: torchrun ends the rest."""
 AT_ONCE = 32
 """Gradients that are summed over the processes in one call: few calls, little copied."""
 PRECEDENCE = timedelta(seconds=5)
-"""How long a process that fails waits for rank 0, which mostly fails of the same, to report it."""
+"""How long a failing process waits until rank 0, which mostly fails of the same, has reported."""
 _REPORTER = "reporter"
 FROM_TORCHRUN = ("RANK", "WORLD_SIZE", "LOCAL_RANK", "MASTER_ADDR", "MASTER_PORT")
 
@@ -57,10 +57,10 @@ class ProcessGroup:
         return self.rank == 0
 
     def shared(self, work: Callable[[], Outcome]) -> Outcome:
-        """What `work` returns on rank 0, on every process; it is pickled on its way.
+        """Run `work` on rank 0 and return its result, sent by pickle, on every process.
 
-        What `work` raises is raised on rank 0, and `FirstProcessFailed` on the others, so that none
-        waits.
+        If `work` fails, rank 0 raises its error and the others raise `FirstProcessFailed`, so that
+        none waits.
         """
         if self.size == 1:
             return work()
@@ -80,7 +80,7 @@ class ProcessGroup:
 
     @contextmanager
     def holding(self, lock: AbstractContextManager[None]) -> Generator[None]:
-        """Hold a lock on rank 0, for all."""
+        """Hold a lock on rank 0 on behalf of all processes."""
         with ExitStack() as held:
             self.shared(lambda: held.enter_context(lock))
             yield
@@ -105,12 +105,12 @@ class ProcessGroup:
     def sum_gradients(
         self, parameters: Iterable[nn.Parameter], sums: Mapping[str, Tensor], stop: bool
     ) -> bool:
-        """Replace gradients and `sums` by their sums over the processes; whether any wants to stop.
+        """Replace gradients and `sums` by their sums over the processes.
 
-        Each process has weighted its parts by their share of the whole batch, so the sum is the
-        mean. A parameter that no process used keeps no gradient, so that the optimizer leaves it
-        alone as it does in a single process; one that only others used counts as zero here. All
-        processes end with the same bits.
+        Returns whether any process passed `stop`. Each process has weighted its parts by their
+        share of the whole batch, so the sum is the mean. A parameter that no process used keeps no
+        gradient, so the optimizer skips it as in a single process; one that only other processes
+        used counts as zero here. All processes end with the same bits.
         """
         if self.size == 1:
             return stop
@@ -125,7 +125,7 @@ class ProcessGroup:
         return stop
 
     def tensors(self, named: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """The tensors that rank 0 calls with, on every process, sent one by one."""
+        """Rank 0's tensors, on every process; they are sent one by one."""
         if self.size == 1:
             return dict(named)
         shapes = self.shared(lambda: {name: value.to("meta") for name, value in named.items()})
@@ -142,7 +142,7 @@ class ProcessGroup:
 
 @contextmanager
 def process_group(device: str) -> Generator[ProcessGroup]:
-    """Join the processes of a torchrun, as the environment describes it; else be one alone.
+    """Join the processes that torchrun started, as the environment says; else a group of one.
 
     Tensors travel by nccl between CUDA devices and by gloo between CPUs, everything else by gloo.
     Within it one process reports an error (`one_reporter`); the others end silently, with the exit
@@ -173,7 +173,7 @@ def process_group(device: str) -> Generator[ProcessGroup]:
             )
             yield ProcessGroup.current()
     finally:
-        # Last: it closes what the others may wait on, and by then they know who reports.
+        # Done last: it closes what the others may wait on, and now they know who reports.
         if dist.is_initialized():
             dist.destroy_process_group()
 
@@ -181,8 +181,8 @@ def process_group(device: str) -> Generator[ProcessGroup]:
 def process_device(name: str) -> torch.device:
     """The device of a `device:` param for this process.
 
-    Of several processes on CUDA, each takes the GPU of its LOCAL_RANK. Raises `ConfigError` as
-    `resolve_device` does, and where one GPU is named for several processes.
+    With several processes on CUDA, each takes the GPU of its LOCAL_RANK. Raises `ConfigError` as
+    `resolve_device` does, and if one GPU is named for several processes.
     """
     several = int(os.environ.get("WORLD_SIZE", "1")) > 1
     if several and name.startswith("cuda:"):
@@ -197,9 +197,9 @@ def process_device(name: str) -> torch.device:
 
 @contextmanager
 def one_reporter(store: dist.Store, rank: int) -> Generator[None]:
-    """Within it, an error of the user's kind is raised on one process; the others exit with 2.
+    """Within it, only one process raises an error that a user can mend; the others exit with 2.
 
-    Rank 0 reports where it fails too, else the first process that fails, with its rank in the
+    Rank 0 reports if it fails too, else the first process that fails, with its rank in the
     message. Rank 0 also reports a stop, unless torchrun stops all because one process failed.
     `store` is the store of the rendezvous: it needs no other process to answer.
     """
@@ -211,7 +211,7 @@ def one_reporter(store: dist.Store, rank: int) -> Generator[None]:
         if rank > 0:
             with suppress(RuntimeError, KeyboardInterrupt):
                 store.wait([_REPORTER], PRECEDENCE)
-        # Where rank 0 held the store and is gone, better to report an error twice than never.
+        # If the store is gone with rank 0, it is better to report an error twice than never.
         with suppress(RuntimeError):
             if store.compare_set(_REPORTER, "", str(rank)) != str(rank).encode():
                 raise SystemExit(2) from None
@@ -235,7 +235,7 @@ def _is_reported(store: dist.Store) -> bool:
 
 @contextmanager
 def deferred_interrupt() -> Generator[Callable[[], bool]]:
-    """Within it, a first SIGINT or SIGTERM only sets what the yielded function returns.
+    """Within it, the first SIGINT or SIGTERM only makes the yielded function return True.
 
     A step stopped half-way would leave some weights updated and others not, so the loop asks
     between steps. A second signal raises `KeyboardInterrupt` at once. Outside the main thread,

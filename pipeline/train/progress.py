@@ -28,9 +28,9 @@ class Pace(NamedTuple):
     """How fast a run goes."""
 
     steps_per_s: float
-    """Since the reading before."""
+    """Since the previous reading."""
     data_wait_share: float
-    """Of that time, spent waiting for batches."""
+    """The share of that time that was spent waiting for batches."""
     peak_memory: int
     """See `peak_memory_bytes`."""
     trained_s: float
@@ -40,7 +40,8 @@ class Pace(NamedTuple):
 class Progress(AbstractContextManager["Progress"]):
     """Counts steps on stderr with a bar, or a line a minute; only one process shows it.
 
-    It also measures the speed of steps and their data, without evaluations and checkpoints.
+    It also measures the pace of the steps and the wait for data; evaluations and checkpoints do not
+    count.
     """
 
     def __init__(
@@ -77,7 +78,7 @@ class Progress(AbstractContextManager["Progress"]):
         return Pace(pace, share, peak_memory_bytes(self._device), self.trained_s)
 
     def show(self, pace: Pace, loss: float, lr: float) -> None:
-        """Show these behind the bar; without a bar in a line, once the last is a minute old."""
+        """Show these behind the bar; without a bar, print a line if the last is a minute old."""
         self._bar.set_postfix(
             loss=f"{loss:.4f}",
             lr=f"{lr:.1e}",
@@ -103,7 +104,7 @@ class Progress(AbstractContextManager["Progress"]):
 
     @contextmanager
     def paused(self) -> Generator[None]:
-        """Within it no time is counted."""
+        """Within it, no time is counted as training."""
         self._before, self._since = self.trained_s, None
         yield
         self._since = time.perf_counter()
@@ -128,7 +129,7 @@ def describe_data(
 ) -> list[str]:
     """Lines for the user on the store, its streams and the split.
 
-    Warnings come last: of a source or a stream that the store has and the training episodes lack.
+    Warnings come last: they name sources and streams of the store that the training episodes lack.
     """
     slots, dim = store.feature_shape
     sides = split_parts(store, split).values()

@@ -1,7 +1,8 @@
 """A training run on disk: its place, what decides its numbers, whether it is resumed or finished.
 
 A run works in `<output>.part` (`run.json`, `best/`, `last/`) and renames it to `<output>` when it
-is finished; a stopped run is resumed there. No torch, which takes over a second to import.
+is finished; a stopped run is resumed there. This module does not import torch, which would take
+over a second.
 """
 
 import hashlib
@@ -61,8 +62,8 @@ FREE_PARAMS = {
     "store",
     "grad_accumulation",
 }
-"""Params that may change between a stop and the next start: they decide no number of the run. The
-last decides `parts` together with the number of processes, and `parts` is compared."""
+"""Params that may change between a stop and the next start: they decide no number of the run.
+`grad_accumulation` times the number of processes is `parts`, which is compared instead."""
 NOTHING: Mapping[str, Any] = MappingProxyType({})
 
 
@@ -81,7 +82,7 @@ class RunDocument(Document):
 
 @dataclass(frozen=True)
 class TrainingRun:
-    """A place on disk with room for one training run."""
+    """One training run and its place on disk."""
 
     output: Path
     status: Literal["new", "resumed", "finished"]
@@ -109,8 +110,8 @@ class TrainingRun:
     def begin(self) -> None:
         """Create the part of a new run with its `run.json`; does nothing for a resumed run.
 
-        Another unfinished run that has a checkpoint moves to `<output>.part-old`, in place of an
-        older one there. Call it once the params are known to be good.
+        Another unfinished run that has a checkpoint is moved to `<output>.part-old` and replaces an
+        older one there. Call this only when the params are known to be good.
         """
         if self.status != "new":
             return
@@ -125,7 +126,7 @@ class TrainingRun:
     def finish(self) -> None:
         """Rename the part to the output, in place of an older run, without the trainer's state.
 
-        Only resuming takes that state, and it is four times as large as what learns.
+        Only resuming needs that state, and it is four times as large as the trainable parameters.
         """
         put_in_place(self.part, self.output, RUN_FOLDER)
         _drop_trainer_state(self.output)
@@ -133,7 +134,7 @@ class TrainingRun:
 
 @contextmanager
 def run_lock(params: TrainHeadParams) -> Generator[None]:
-    """Hold a run's output and its logs. Raises `StoreLocked` where another run works in either."""
+    """Lock a run's output and its logs. Raises `StoreLocked` where another run works in either."""
     with build_lock(params.output), build_lock(params.logs):
         yield
 
@@ -147,9 +148,9 @@ def open_run(
     """The run of these params on this store: new, resumed or finished. It changes no run.
 
     `extra_identity` is what else decides the numbers (`FeatureSource.identity`); `section` is the
-    section of the params that errors name. A finished run with a damaged checkpoint is new: it is
-    trained again and then replaced. Raises `CheckpointMismatch` where an unfinished run with a
-    checkpoint saw other features or streams, `CheckpointIncomplete` where its `run.json` is
+    section of the params that errors name. A finished run with a damaged checkpoint counts as new:
+    it is trained again and then replaced. Raises `CheckpointMismatch` where an unfinished run with
+    a checkpoint saw other features or streams, `CheckpointIncomplete` where its `run.json` is
     damaged, and `ConfigError` where no training wrote the output.
     """
     output, identity = params.output, run_identity(params, store, extra_identity)
@@ -188,7 +189,7 @@ def open_run(
 
 
 def _is_run(folder: Path) -> bool:
-    """Whether a training wrote the folder; an unreadable `run.json` counts beside a checkpoint."""
+    """Whether a training wrote the folder; beside a checkpoint, `run.json` may be unreadable."""
     if _has_checkpoint(folder):
         return (folder / RUN).is_file()
     try:
@@ -215,7 +216,7 @@ def finished_run(params: TrainHeadParams, path: Path) -> TrainingRun | None:
 
 
 def _compare(part: Path, identity: Mapping[str, Any], section: str) -> str:
-    """How the unfinished run in `part` differs from this one; refused where its store does."""
+    """How the unfinished run in `part` differs; raises `CheckpointMismatch` if its store does."""
     _, prior = read_document(part / RUN, RunDocument)
     if differing := list_differences(prior["source"], identity["source"]):
         raise CheckpointMismatch(
@@ -270,13 +271,13 @@ def recordings_of(store: FeatureStore) -> dict[str, Any]:
 def policy_shape(
     store: FeatureStore, normalization: Normalization, anchor: Sequence[str] = ()
 ) -> PolicyShape:
-    """The widths that this store gives to a policy, and which action channels are anchored.
+    """The widths of this store's streams, and which action channels are anchored.
 
     A stream without statistics is absent from the training ticks, so it has width 0. Raises
-    `ConfigError` for an anchored channel whose motion no state of the training ticks tells.
+    `ConfigError` for an anchored channel whose motion no state of the training ticks measures.
     """
     action, state = store.streams["action"], store.streams["state"]
-    told = state if normalization.state else {"names": [], "units": []}
+    known_state = state if normalization.state else {"names": [], "units": []}
     return PolicyShape(
         *store.feature_shape,
         sensor_channels=store.sensor_channels if normalization.sensor else 0,
@@ -285,7 +286,7 @@ def policy_shape(
         action_groups=action_groups(action["names"], action["units"]),
         views=store.array("vl/frame_time").shape[1],
         state_kinds=channel_kinds(state["names"], state["units"]) if normalization.state else (),
-        anchors=find_anchors(action, told, anchor),
+        anchors=find_anchors(action, known_state, anchor),
     )
 
 
@@ -297,10 +298,10 @@ class TrainedPolicy:
     source: Mapping[str, Any] | None = None
     """Its store, as `source_of` describes it; None where its document is damaged."""
     recordings: Mapping[str, Any] | None = None
-    """Of a run: the episodes and rows of its store."""
+    """For a run: the episodes and rows of its store."""
     episodes: frozenset[str] | None = None
-    """Of a single checkpoint: digests of the files of its training and test episodes; None where it
-    has no test."""
+    """For a single checkpoint: digests of the files of its training and test episodes; None if it
+    has no test episode."""
     damage: str | None = None
 
     def depends_on(self, store: FeatureStore) -> str | None:

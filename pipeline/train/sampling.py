@@ -1,6 +1,6 @@
 """What each step of a run learns from: a weighted mixture of shuffled sources, cut into parts.
 
-Everything is a function of (seed, step), so that a run goes on from any step without stored state.
+Everything is a function of (seed, step), so a run can resume at any step without stored state.
 """
 
 from collections.abc import Iterator, Mapping
@@ -25,7 +25,7 @@ def ticks_by_source(store: FeatureStore, ticks: Ticks) -> dict[str, Ticks]:
     """These ticks by source of the store, in their order; empty for a source without any."""
     starts = np.array([episode.ticks.start for episode in store.episodes], np.int64)
     names = np.array([episode.source for episode in store.episodes])
-    # Of episodes that start at the same tick, only the last can hold it: the others are empty.
+    # If several episodes start at the same tick, only the last holds it: the others are empty.
     sources = names[np.searchsorted(starts, ticks, side="right") - 1]
     return {name: ticks[sources == name] for name in store.sources}
 
@@ -35,10 +35,10 @@ class TickSampler:
 
     A source's share of the draws is its weight times its number of ticks, over the sum of these:
     weight 1 for all is uniform over ticks, weight 3 shows a tick of that source three times as
-    often. After any number of draws each source is within a draw of its share with up to three
-    sources, within 1.5 with eight. Within a source every tick comes once an epoch. A weight that is
-    not named is 1; a source of weight 0 or without ticks is left out. Raises `ConfigError` on
-    unknown names or where nothing is left.
+    often. After any number of draws, the count of each source is within 1 draw of its share with up
+    to three sources, within 1.5 with eight. Within a source every tick comes once an epoch. Weights
+    are 1 unless named; a source of weight 0 or without ticks is left out. Raises `ConfigError` on
+    unknown names or if no source is left.
     """
 
     def __init__(
@@ -78,8 +78,8 @@ class TickSampler:
     def count_drawn(self, draws: int) -> dict[str, int]:
         """How many of the first `draws` draws each source gives.
 
-        At each fork the left takes its rounded share and the right the rest, so that one more draw
-        is one more of exactly one source. Rounding source by source would take draws back.
+        At each fork the left side takes its rounded share and the right side the rest, so one more
+        draw adds 1 to exactly one source. Rounding each source alone could lower a count again.
         """
         drawn = {frozenset(self._ticks): draws}
         for whole, left, right, mass, total in self._forks:
@@ -108,10 +108,11 @@ Sources = frozenset[str]
 
 
 def _fork(masses: Mapping[str, int]) -> list[tuple[Sources, Sources, Sources, int, int]]:
-    """How draws fork from all sources down to each: (whole, left, right, mass of left, of whole).
+    """The forks from the set of all sources down to single ones, as in a Huffman tree.
 
-    The two lightest sets are joined until one is left. So a heavy source is a fork or two away, and
-    few roundings, of half a draw each, add up on the way to it.
+    Each is (whole, left, right, mass of left, mass of whole). The two lightest sets are joined
+    until one is left. So a heavy source is a fork or two away from the set of all, and few
+    roundings, of half a draw each, add up on the way to it.
     """
     sets = [(masses[name], frozenset((name,))) for name in sorted(masses)]
     forks: list[tuple[Sources, Sources, Sources, int, int]] = []
@@ -123,8 +124,8 @@ def _fork(masses: Mapping[str, int]) -> list[tuple[Sources, Sources, Sources, in
 
 
 _VARIANTS, _LAGS = (0, 1), (0, 2)
-"""Follow (seed, step) in the seeds of variants and lags, so that these differ from the seed of any
-part: numpy reads (seed, step, part) as (seed, step, part, 0), so a third number would not do."""
+"""Appended to (seed, step) in the seeds of variants and lags, so that these differ from the seed of
+every part. One number would not do: numpy reads (seed, step, part) as (seed, step, part, 0)."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -132,18 +133,18 @@ class StepPart(BatchIndices):
     """A part of a step's batch, computed in one pass; a feed hands it back beside its batch."""
 
     share: float
-    """Of the step's valid chunk steps: the weight of the part's mean loss in the step's."""
+    """The part's share of the step's valid chunk steps: the weight of its mean loss."""
     seed: int
-    """Of the part's dropout and sampled noise: a function of (seed, step, part)."""
+    """The seed of the part's dropout and sampled noise: a function of (seed, step, part)."""
 
 
 class Plan:
-    """The ticks of every step, in as many parts as processes times `grad_accumulation`.
+    """The ticks of every step, cut into one part for each process and accumulation.
 
-    Process p has the parts p·a to p·a + a - 1, so that N processes do what one does with N times
-    the accumulation a. Everything follows from params and store: processes exchange nothing.
-    `section` is the section of the params that errors name. Raises `ConfigError` where a part would
-    be empty.
+    With `grad_accumulation` a, process p has the parts p·a to p·a + a - 1, so N processes do what
+    one process does with N times the accumulation. Everything follows from params and store:
+    processes exchange nothing. `section` is the section of the params that errors name. Raises
+    `ConfigError` where a part would be empty.
     """
 
     def __init__(
@@ -185,7 +186,7 @@ class Plan:
         late = np.random.default_rng((seed, step, *_LAGS))
         feature_lag = late.integers(self._params.feature_lag + 1, size=len(ticks))
         sensor_lag_s = late.uniform(0, self._params.sensor_lag_s, len(ticks))
-        # The steps of a chunk before its episode's end count; with terminal_stop all do.
+        # Only chunk steps before the episode's end count; with terminal_stop all do.
         counts = np.full(len(ticks), self._params.horizon)
         if not self._params.terminal_stop:
             counts = np.minimum(counts, self._ends[ticks] - ticks)

@@ -18,15 +18,15 @@ Errors = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Cells:
-    """The sets of ticks over which errors are summed: those of one episode and one phase.
+    """The sets of ticks over which errors are summed; a cell has those of one episode and phase.
 
-    Every figure is a sum over cells: of episodes, of groups of episodes, or of a phase.
+    Every figure is a sum over cells: those of episodes, of groups of episodes, or of a phase.
     """
 
     episode: NDArray[np.int64]
     """(cell,) index in the store."""
     group: NDArray[np.str_]
-    """(cell,) the group of its episode, which a bootstrap draws."""
+    """(cell,) the group of its episode; a bootstrap draws groups."""
     phase: NDArray[np.str_]
     """(cell,) empty where phases are not known."""
     ticks: NDArray[np.int64]
@@ -142,21 +142,21 @@ class Comparison:
         return replace(self, cells=cells, scores=scores)
 
     def weights(self, group: ActionGroup | None = None) -> Errors:
-        """(action_dim,) the weight of each dimension in the error of a group; of None, overall."""
+        """(action_dim,) the weight of each dimension in a group's error; None: in `overall`."""
         dimensions = self.varying() if group is None else list(group.dimensions)
         weights = np.zeros(len(self.names))
         weights[dimensions] = 1 / len(dimensions)
         return weights / np.where(self.scale > 0, self.scale, 1) if group is None else weights
 
     def error(self, method: str, group: ActionGroup | None = None) -> float:
-        """Mean absolute error: a group's in its unit; of None, `overall`."""
+        """Mean absolute error of a group, in its unit; with None, `overall`."""
         return float(self.scores[method].mae @ self.weights(group))
 
     def overall(self, method: str) -> float:
         """Mean absolute error in units of the training standard deviation.
 
         The mean over the dimensions that vary, each divided by its standard deviation; on normally
-        distributed actions, the mean action has an error of 0.8. Where none varies, all count,
+        distributed actions, the mean action has an error of 0.8. If no dimension varies, all count,
         undivided.
         """
         return self.error(method)
@@ -166,16 +166,16 @@ class Comparison:
         return self.in_training_std(self.scores[method].mae_episode).mean(axis=-1)
 
     def ranked(self) -> list[int]:
-        """Places in `episodes`, from the lowest `overall_by_episode` of the policy to the highest.
+        """Indices into `episodes`, sorted by the policy's `overall_by_episode`, lowest first.
 
-        Equal ones keep their order.
+        Episodes of equal error keep their order.
         """
         return np.argsort(self.overall_by_episode("policy"), kind="stable").tolist()
 
     def extremes(self) -> list[tuple[str, int]]:
         """The episodes of lowest and highest error, each with its name and store index.
 
-        A single entry where there is one episode.
+        There is a single entry if there is one episode.
         """
         order = self.ranked()
         best, worst = order[0], order[-1]
@@ -194,10 +194,10 @@ class Comparison:
         return [group for group in self.groups if varying & set(group.dimensions)]
 
     def low_variance(self) -> dict[int, float]:
-        """The dimensions that hardly vary, so that their noise counts like a motion in `overall`.
+        """The dimensions that hardly vary in training; in `overall` their noise counts like motion.
 
-        Each with the usual training deviation of similar dimensions: of similar names and equal
-        unit, or (joints named after limbs) of equal unit.
+        Each maps to the usual training deviation of similar dimensions: of those with similar names
+        and the same unit or, for joints named after limbs, of those with the same unit.
         """
         by_unit = hardly_moving(self.scale, [""] * len(self.names), self.units)
         return by_unit | hardly_moving(self.scale, self.names, self.units)
@@ -209,7 +209,7 @@ class Comparison:
         return replace(self, scale=scale)
 
     def in_training_std(self, errors: Errors) -> Errors:
-        """Errors (..., action_dim) of the `varying` dimensions, over their training deviations."""
+        """Errors (..., action_dim) of the `varying` dimensions, divided by their training std."""
         dimensions = self.varying()
         return errors[..., dimensions] / np.where(self.scale > 0, self.scale, 1)[dimensions]
 
@@ -233,10 +233,11 @@ def compare(
     phase: NDArray[np.str_] | None = None,
     execute: int = 1,
 ) -> Comparison:
-    """The errors of the policy and of the actions of `others`, (tick, horizon or 1, action_dim).
+    """The errors of the policy and of other methods at the same ticks.
 
-    `space` is that of `action_space`. `group` and `phase` (tick,) are those of each tick; without
-    them each episode is a group, and phases are not known.
+    `others` has the actions (tick, horizon or 1, action_dim) of each method; `space` is what
+    `action_space` returns. `group` and `phase` (tick,) belong to each tick; without them each
+    episode is a group, and phases are not known.
     """
     episodes = predictions.episodes
     labels = [

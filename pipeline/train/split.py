@@ -29,7 +29,7 @@ _SHOWN = 5
 """Moved groups that a note lists."""
 
 _SLACK_S = 1e-6
-"""Times that differ by less are equal: float64 seconds since 1970 are this coarse."""
+"""Times that differ by less count as equal: float64 seconds since 1970 are this coarse."""
 
 Groups = Mapping[str, Sequence[Episode]]
 Ranges = Mapping[Side, tuple[float, float]]
@@ -38,7 +38,7 @@ Ranges = Mapping[Side, tuple[float, float]]
 
 @dataclass(frozen=True, eq=False)
 class Split:
-    """Store-global ticks, ascending: trained on, choosing the checkpoint, and reported."""
+    """Ascending store-global ticks: to train on, to choose the checkpoint by, and to report on."""
 
     train: NDArray[np.int64]
     val: NDArray[np.int64]
@@ -58,9 +58,9 @@ def split_by_episode(
     """The split of the store's episodes into whole groups, drawn as the module's docstring says.
 
     An added episode moves only its own group, unless a side was empty before or would be after.
-    Every side with a share above 0 has a group of each source of three or more groups, and of the
-    whole store; a source of two groups has one to train on. With `folds`, each group is test in
-    one fold, and `val` is drawn from the others. `params.train` keeps that many training groups,
+    Every side with a share above 0 has a group of each source that has three or more groups, and a
+    group of the store; a source of two groups has one to train on. With `folds`, each group is test
+    in one fold, and `val` is drawn from the others. `params.train` keeps that many training groups,
     those of the lowest ranks.
 
     Of two groups one is test, and the tail of the other is val. A single group is cut by time into
@@ -133,7 +133,10 @@ def _test_groups(
 
 
 def _ranges(shares: Mapping[Side, float], drawn: float) -> Ranges:
-    """The ranks of each side, train last; `shares` are of all groups, of which `drawn` are here."""
+    """The ranks of each side, train last.
+
+    `shares` are shares of all groups; the ranks divide only the share `drawn` of the groups.
+    """
     sides: tuple[Side, ...] = (*shares, "train")
     edges = np.minimum(np.cumsum([0.0, *shares.values()]) / drawn, 1.0).tolist()
     return dict(zip(sides, pairwise((*edges, 1.0)), strict=True))
@@ -164,10 +167,10 @@ class _Need:
 
 
 def _needs(groups: Groups, drawn: Collection[str], sides: tuple[Side, ...]) -> list[_Need]:
-    """A need of each source, by name, then that of the store, which outweighs all sources.
+    """The need of each source, by name, then the need of the store, which outweighs all others.
 
-    A source of three or more groups needs each side, as far as its groups suffice after folds; a
-    source of two needs one to train on; a source of one needs nothing.
+    A source of three or more groups needs one on each side, if enough are left after folds, else
+    one to train on; a source of two needs one to train on; a source of one needs nothing.
     """
     by_source: dict[str, set[str]] = {}
     for name, group in groups.items():
@@ -186,11 +189,11 @@ def _needs(groups: Groups, drawn: Collection[str], sides: tuple[Side, ...]) -> l
 def _fill_empty_sides(
     side_of: dict[str, Side], ranks: Mapping[str, float], ranges: Ranges, needs: Sequence[_Need]
 ) -> list[str]:
-    """Move a group to each empty side of a need, in place; returns what was moved.
+    """Move a group to each empty side of a need, in place; returns notes on the moves.
 
-    Need by need, the group moves that leaves the fewest empty sides to this need and to those
-    before it; of several, the one whose rank is nearest to the side's. None moves where every move
-    would empty as much as it fills.
+    For each need in turn, the best move leaves the fewest empty sides in this need and those before
+    it; among equals, the group whose rank is nearest to the side's range moves. No group moves if
+    every move would empty as much as it fills.
     """
     notes: list[str] = []
     for number, need in enumerate(needs, 1):
@@ -221,9 +224,9 @@ def _change(side_of: Mapping[str, Side], name: str, side: Side, needs: Iterable[
 def _cut_by_time(
     store: FeatureStore, episodes: Sequence[Episode], shares: Mapping[Side, float], horizon: int
 ) -> tuple[dict[Side, NDArray[np.int64]], list[str]]:
-    """The sides of a single group, and what to note: test is its end, then val, then train.
+    """The sides of a single group, and notes: test is its end, val is before it, then train.
 
-    All episodes are cut at the same instants, for they are one recording in several formats. A
+    All episodes are cut at the same instants, because they are one recording in several formats. A
     side begins at the earliest instant at which the last `share` of an episode's ticks begins.
     """
     if not shares:
@@ -266,9 +269,9 @@ def _cut_by_time(
 
 
 def _elapsed(store: FeatureStore, episode: Episode) -> NDArray[np.float64]:
-    """(tick,) seconds since the newest frame of the first VL row, or without one the first tick.
+    """(tick,) seconds since the newest frame of the first VL row, else since the first tick.
 
-    So formats whose clocks differ and whose ticks begin apart share one clock.
+    So formats whose clocks differ, or whose ticks begin at different times, share one clock.
     """
     time = store.array("tick/time")[episode.ticks.start : episode.ticks.stop]
     frames = store.array("vl/frame_time")[episode.vl_rows.start]

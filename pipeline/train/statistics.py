@@ -28,7 +28,7 @@ ONE_WAY = 0.9
 """A channel advances one way where the mean of its net motions in the episodes is at least this
 share of their root mean square."""
 _STATE_TICKS = 16_384
-"""Training ticks at most whose windows give the statistics of the states."""
+"""The most training ticks whose windows give the statistics of the states."""
 _AT_ONCE = 1024
 Rows = range | NDArray[np.int64]
 """Rows of one of the store's arrays."""
@@ -40,7 +40,7 @@ _ARRAYS = {"tick": "tick/action", "vl": "vl/features"} | {
 _NAMES = {"tick": "training actions", "vl": "training features"} | {
     stream: f"training readings of {stream}" for stream in ("sensor", "state")
 }
-"""The names of the arrays' rows in errors."""
+"""What errors call the rows of each array."""
 
 
 def fit_normalization(
@@ -48,14 +48,14 @@ def fit_normalization(
 ) -> Normalization:
     """Statistics per channel over the training `ticks` and the readings before them.
 
-    Features: over the VL rows that these ticks use, each once, with all variants alike, so (slot,
-    dim). Sensor: over the readings from each episode's start to its last tick. States: as a policy
-    takes them (`state_channels.expand`), over the windows of at most 16,384 evenly spaced ticks. A
-    stream that no tick has gets no statistics. No spread is far below what is usual for similar
-    inputs (`ChannelStatistics.floored`). Reads the store once, in chunks of about 64 MB, a few at a
-    time on `threads` threads (None: as many as torch has), with a bar on a terminal. The bits do
-    not depend on the number of threads. Raises `NumericsError` on NaN or inf, naming episode, tick
-    or reading, time and channel.
+    Features: over the VL rows that these ticks use, each once, with all variants together, so
+    (slot, dim). Sensor: over the readings from each episode's start to its last tick. States: as a
+    policy takes them (`state_channels.expand`), over the windows of at most 16,384 evenly spaced
+    ticks. A stream that no tick has gets no statistics. A spread far below what is usual for
+    similar inputs is raised (`ChannelStatistics.floored`). Reads the store once, in chunks of about
+    64 MB, a few at a time on `threads` threads (None: as many as torch has), with a bar on a
+    terminal. The bits do not depend on the number of threads. Raises `NumericsError` on NaN or inf,
+    naming episode, tick or reading, time and channel.
     """
     threads = torch.get_num_threads() if threads is None else threads
     parts: dict[str, list[Rows]] = {
@@ -63,12 +63,12 @@ def fit_normalization(
         "vl": _cut(store, "vl", np.unique(store.array("tick/vl_row")[ticks])),
         "sensor": _readings(store, ticks, "sensor"),
     }
-    total = sum(len(rows) for several in parts.values() for rows in several)
+    total = sum(len(rows) for pieces in parts.values() for rows in pieces)
     with tqdm(total=total, desc="normalisation", unit="row", leave=False, disable=None) as bar:
         fitted = {
-            stream: _fit(store, stream, several, bar, threads)
-            for stream, several in parts.items()
-            if several or stream == "tick"
+            stream: _fit(store, stream, pieces, bar, threads)
+            for stream, pieces in parts.items()
+            if pieces or stream == "tick"
         }
     features, sensor = fitted.get("vl"), fitted.get("sensor")
     if features is not None:
@@ -80,7 +80,11 @@ def fit_normalization(
 
 
 def anchored_channels(store: FeatureStore, ticks: Ticks, params: TrainHeadParams) -> list[str]:
-    """The action channels that `train_head.anchor` means on the training `ticks`."""
+    """The action channels that `train_head.anchor` names; "auto" chooses by the training `ticks`.
+
+    It chooses translations that the state measures too; with a sensor, it leaves out those that
+    advance one way (`ONE_WAY`).
+    """
     if params.anchor != "auto":
         return [*params.anchor]
     known = store.feature_shape[0] and _readings(store, ticks, "state")
@@ -95,8 +99,8 @@ def anchored_channels(store: FeatureStore, ticks: Ticks, params: TrainHeadParams
         net = np.zeros((episode.max() + 1, len(groups)))
         np.add.at(net, episode, store.array("tick/action")[ticks])
         one_way = np.abs(net.mean(axis=0)) >= ONE_WAY * np.sqrt(np.square(net).mean(axis=0))
-    told = zip(action["names"], groups, one_way, strict=True)
-    return [n for n, group, away in told if n in chosen and group == "translation" and not away]
+    channels = zip(action["names"], groups, one_way, strict=True)
+    return [n for n, group, away in channels if n in chosen and group == "translation" and not away]
 
 
 def _fit_state(store: FeatureStore, ticks: Ticks, windows: Windows) -> ChannelStatistics | None:
@@ -168,7 +172,7 @@ def check_finite(
 ) -> None:
     """Raise `NumericsError`, naming the place, where a valid value of these rows is not finite.
 
-    `values` has a row for each of `rows`; of `vl` one for each variant.
+    `values` has a row for each of `rows`; for `vl`, one for each variant of each row.
     """
     bad = first_non_finite(values, valid)
     if bad is None:
@@ -203,7 +207,7 @@ def _cut(store: FeatureStore, stream: str, rows: NDArray[np.int64]) -> list[Rows
 def _read(
     store: FeatureStore, stream: str, rows: Rows
 ) -> tuple[NDArray[Any], NDArray[np.bool_] | None]:
-    """The values; of features (row of one variant, slot, dim), and which slots are valid."""
+    """The values; for features (row of one variant, slot, dim), also which slots are valid."""
     array = store.array(_ARRAYS[stream])
     values = widen(array[rows.start : rows.stop] if isinstance(rows, range) else array[rows])
     if stream != "vl":

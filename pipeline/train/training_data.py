@@ -1,4 +1,4 @@
-"""What a checkpoint says of the data it was trained on, and the same data in a store."""
+"""The training data that a checkpoint describes, and how it is found again in a store."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
@@ -21,7 +21,7 @@ _SHOWN = 5
 
 
 def source_of(store: FeatureStore) -> dict[str, Any]:
-    """What a checkpoint keeps of its store, and what another store must agree with."""
+    """The description of a store that a checkpoint keeps, and that another store must equal."""
     return {key: getattr(store, "spec" if key == "feature_spec" else key) for key in SOURCE_KEYS}
 
 
@@ -111,7 +111,7 @@ def find_ticks(
 def groups_of(
     store: FeatureStore, checkpoint: PolicyCheckpoint, ticks: NDArray[np.int64]
 ) -> NDArray[np.str_]:
-    """(tick,) the group of the episode of each of these ticks, which `find_ticks` gave."""
+    """(tick,) the group of each tick's episode; `ticks` come from `find_ticks`."""
     parts = chain.from_iterable(side.values() for side in checkpoint.split.values())
     # By content: a renamed episode keeps its group, and episodes of equal content share one.
     group_of = {part.content: part.group for part in parts}
@@ -120,7 +120,7 @@ def groups_of(
 
 
 def refuse_tuned_episodes(store: FeatureStore, split: Split) -> list[str]:
-    """Refuse a split that holds out what the store's model was tuned on; returns notes to print.
+    """Refuse a split that holds out episodes the model was tuned on; returns notes to print.
 
     Raises `ConfigError` where test has an episode that the model was tuned or chosen on, or val
     one that it was tuned on.

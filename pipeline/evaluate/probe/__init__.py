@@ -1,5 +1,5 @@
-"""Which stored feature carries the action: slots ranked by what a linear reader finds in them.
+"""Which stored features predict the action: slots ranked by a linear regression from each.
 
-`folds` holds recordings out, `inputs` is what is read at a tick, `ridge` the regression, `study`
-does it for all slots and says which are better, and `tables` tells it.
+`folds` holds recordings out, `inputs` prepares what is read at a tick, `ridge` is the regression,
+`study` scores all slots and says which are better, and `tables` prints and writes the results.
 """

@@ -12,7 +12,7 @@ from pipeline.train.batches import evenly
 from pipeline.train.groups import episodes_by_group
 
 _PARTS = 4
-"""Parts of a fold at most, which are dealt as units: bounds time and memory."""
+"""The most parts of a fold; parts are dealt as units. This bounds time and memory."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,14 +40,14 @@ class ProbeFolds:
 
     @property
     def fold(self) -> NDArray[np.int64]:
-        """(repeat, tick)"""
+        """(repeat, tick): the fold that holds a tick out in each deal."""
         return self.deals[:, self.group]
 
 
 def fold_by_recording(
     store: FeatureStore, folds: int, horizon: int, max_ticks: int | None = None, repeats: int = 1
 ) -> ProbeFolds:
-    """Whole recordings in at most `folds` folds of about as many ticks, dealt `repeats` times.
+    """Deal whole recordings `repeats` times to at most `folds` folds of about equally many ticks.
 
     Episodes that are one recording in several formats share a fold. Ticks whose chunk of `horizon`
     actions reaches beyond the episode's end are left out, so that all steps of the chunk are scored
@@ -63,8 +63,8 @@ def fold_by_recording(
     ticks = np.flatnonzero(recording >= 0)
     most = len(ticks) if max_ticks is None else max_ticks
     read = evenly(ticks, most)
-    there, group = np.unique(recording[read], return_inverse=True)
-    recordings = len(there)
+    distinct, group = np.unique(recording[read], return_inverse=True)
+    recordings = len(distinct)
     if recordings < 2:
         raise StoreMismatch(
             f"{store.path}: expected at least two recordings of {horizon} ticks or more, of which "

@@ -22,9 +22,9 @@ Folds = Int64[np.ndarray, "repeat row"]
 PAST_ACTIONS = 2
 """Known actions before the tick, as many as the linear-fit baseline has."""
 WIDTH = 1024
-"""Inputs at most of a slot, or of several slots together."""
+"""The most inputs of a slot, or of several slots together."""
 STREAM_WIDTH = 64
-"""Inputs at most of each summary of channels that share a unit."""
+"""The most inputs of each summary of channels that share a unit."""
 LIMIT = 5.0
 """Columns are clipped at so many standard deviations from the mean of any training rows."""
 STILL = 0.1
@@ -39,12 +39,12 @@ class SlotName(Slot):
 
     @property
     def group(self) -> "SlotName":
-        """Its choice of layer, norm and pooling."""
+        """The name of the group with its layer, norm and pooling."""
         return SlotName(self.layer, self.norm, self.pooling)
 
     @property
     def label(self) -> str:
-        """In a few words."""
+        """The name in a few words."""
         words = f"layer {self.layer}{'' if self.norm else ', no norm'}, {self.pooling}"
         words += "" if self.view is None else f", {self.view}"
         return words + ("" if self.cell is None else f" cell {self.cell[0]},{self.cell[1]}")
@@ -56,7 +56,7 @@ def read_slots(
     """These slots of the VL `rows` as inputs side by side, and where at least one is valid.
 
     `fold` is the fold that holds each row out. The slots share `WIDTH` inputs; a slot with more
-    channels is reduced to its main directions. An invalid slot is at its mean, which is 0.
+    channels is reduced to its main directions. An invalid slot gets its mean, which is 0.
     Raises `NumericsError` on NaN or inf, naming the place.
     """
     inputs: list[Inputs] = [np.empty((len(rows), 0))]
@@ -75,7 +75,7 @@ def read_slots(
 def past_actions(store: FeatureStore, ticks: Int64[np.ndarray, " row"], fold: Folds) -> Inputs:
     """The actions of the `PAST_ACTIONS` ticks before each; the mean before an episode's start.
 
-    With them as inputs, a slot gains nothing by telling the robot's own motion.
+    With them as inputs, a slot gains nothing from showing the robot's own motion.
     """
     action, start = store.array("tick/action"), store.array("episode/tick_start")
     first = start[store.episode_of(ticks)]
@@ -99,10 +99,10 @@ def summarize(
 ) -> Inputs:
     """The last, the mean and the spread of every channel over the window before each tick.
 
-    No column where the store lacks the stream. More than `STREAM_WIDTH` channels of one unit, such
-    as an A-scan's, are reduced to that many main directions of each summary, so that a force beside
-    them is not lost. No reading is later than its tick. A tick without a reading has the mean of
-    the others, and a last column marks it. `fold` is the fold that holds each tick out.
+    There is no column if the store lacks the stream. More than `STREAM_WIDTH` channels of one unit,
+    such as an A-scan's, are reduced to that many main directions of each summary, so that a force
+    beside them is not lost. No reading is later than its tick. A tick without a reading gets the
+    mean of the others, and a last column marks it. `fold` is the fold that holds each tick out.
     Raises `NumericsError` on NaN or inf, naming the place.
     """
     inputs: list[Inputs] = [np.empty((len(ticks), 0))]
@@ -159,9 +159,10 @@ def reduce(values: Float[np.ndarray, "row channel"], fold: Folds, width: int) ->
 def limit(columns: Inputs, fold: Folds) -> Inputs:
     """Columns of mean 0 and spread 1 over all folds, clipped to what every fold is trained on.
 
-    A joint that moves in one recording only has a spread of about 0 in the training rows when that
-    one is held out; in such units it would be thousands there, and so would the prediction. So a
-    column z, of mean m_f and spread s_f over the rows of all folds but f, becomes
+    If a joint moves in one recording only, its spread in the training rows is about 0 when that
+    recording is held out. In units of this spread its value there would be thousands, and so would
+    the prediction. So a column z, of mean m_f and spread s_f over the rows of all folds but f,
+    becomes
 
         min(max(z, max_f(m_f - LIMIT s_f)), min_f(m_f + LIMIT s_f))
 
@@ -171,7 +172,7 @@ def limit(columns: Inputs, fold: Folds) -> Inputs:
     """
     held = fold[:, None] == np.arange(fold.max() + 1)[:, None]
     trained = 1.0 - held.reshape(-1, len(columns))
-    # A slot in one fold only: no fold is trained on it without another.
+    # A slot in one fold only has no training rows while that fold is held out.
     trained = trained[trained.any(axis=1)] if trained.any() else np.ones((1, len(columns)))
     trained /= trained.sum(axis=1, keepdims=True)
     mean = trained @ columns

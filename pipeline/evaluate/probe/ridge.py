@@ -38,13 +38,13 @@ class ProbeScore:
     rows: NDArray[np.float64]
     """(group,) ticks that were predicted."""
     penalties: NDArray[np.float64]
-    """(repeat, fold) of the inputs, chosen on the other folds."""
+    """(repeat, fold): the penalty of the inputs, chosen on the other folds."""
 
     @property
     def by_target(self) -> NDArray[np.float64]:
-        """(target,) over all held-out rows: 1 - PRESS / total sum of squares (Allen 1974).
+        """(target,) R^2 over all held-out rows: 1 - PRESS / total sum of squares (Allen 1974).
 
-        The mean over the deals.
+        It is the mean over the deals.
         """
         return 1 - self.losses.mean(axis=0).sum(axis=0) / self.rows.sum()
 
@@ -55,7 +55,7 @@ class ProbeScore:
 
     @cached_property
     def r2(self) -> Figure:
-        """Over all held-out rows and the targets that vary."""
+        """R^2 over all held-out rows and the targets that vary."""
         return estimate(self.explained, self.rows)
 
     @property
@@ -64,17 +64,17 @@ class ProbeScore:
         return self.r2.value
 
     def gain(self, known: "ProbeScore") -> Figure:
-        """The R^2 of this less that of `known`, on the same recordings in the same deals."""
+        """This R^2 minus that of `known`, on the same recordings in the same deals."""
         return estimate(self.explained - known.explained, self.rows)
 
 
 def estimate(explained: NDArray[np.float64], rows: NDArray[np.float64]) -> Figure:
-    """R^2 from what is `explained` (repeat, group) of each recording's `rows`, and its interval.
+    """R^2 and its interval, from the `explained` (repeat, group) part of each recording's `rows`.
 
     The value is the mean over the deals of repeated cross-validation (Burman 1989). The interval
     covers the choice of recordings and of folds: its percentiles are over all deals, in each of
     which the same recordings are drawn with replacement (`bootstrap_means`). Regressions are not
-    fitted anew to each draw.
+    fitted again for each draw.
     """
     draws = bootstrap_means(explained.T, rows[:, None])
     return Figure.of(float(explained.sum(axis=1).mean() / rows.sum()), draws.ravel())
@@ -87,13 +87,13 @@ def cross_validate(
     penalties: Sequence[float],
     known: Sequence[tuple[Inputs, NDArray[np.float64]]] = (),
 ) -> ProbeScore:
-    """The score of ridge regression from `inputs`, which spread by about 1 over all rows.
+    """The score of ridge regression from `inputs`, whose spread is about 1 over all rows.
 
-    Each fold of each deal is predicted from the others, with the penalty that predicts those best,
-    each from all folds but itself, over all targets in units of their spread. The blocks of `known`
-    inputs are used too, each with its own penalties (repeat, fold): one penalty for all would make
-    a few good inputs pay for many idle ones. Raises `NumericsError` for a penalty that is too small
-    for float64.
+    Each fold of each deal is predicted from the other folds. Its penalty is the one that predicts
+    those other folds best, each of them from all folds but itself, over all targets in units of
+    their spread. The blocks of `known` inputs are used too, each with its own penalties (repeat,
+    fold): one penalty for all would make a few good inputs pay for many idle ones. Raises
+    `NumericsError` for a penalty that is too small for float64.
     """
     order = np.argsort(folds.group, kind="stable")
     group = folds.group[order]
@@ -131,7 +131,7 @@ def cross_validate(
 def _regress_out(
     gram: Gram, ridge: Float64[np.ndarray, " known"], rows: Inputs
 ) -> tuple[Gram, Inputs]:
-    """The gram matrix and the rows of inputs and targets, less what the known columns explain."""
+    """The gram matrix and rows of inputs and targets, minus what the known columns explain."""
     width = len(ridge)
     weights = _solve(gram, ridge * gram[0, 0])
     return (
@@ -141,7 +141,7 @@ def _regress_out(
 
 
 def _solve(gram: Gram, ridge: Float64[np.ndarray, " first"]) -> Float64[np.ndarray, "first _"]:
-    """Weights of the first columns, with these penalties, for each of the others."""
+    """Weights of the first columns, with these penalties, to predict each of the others."""
     width = len(ridge)
     system = np.array(gram[:width, :width], order="F")
     system[np.diag_indices(width)] += ridge

@@ -21,29 +21,29 @@ from pipeline.store import FeatureStore
 from pipeline.train.statistics import check_finite
 
 _ROUNDING = 1e-9
-"""A gain below this is none."""
+"""A gain below this counts as none."""
 
 
 @dataclass(frozen=True, eq=False)
 class ProbeResult:
-    """How well a slot or a group of slots predicts; where it is invalid, by its mean."""
+    """How well a slot or a group of slots predicts; where it is invalid, its mean is used."""
 
     name: SlotName
     slots: tuple[int, ...]
     channels: int
-    """Of all its slots together."""
+    """Number of channels of all its slots together."""
     inputs: int
     """Number of inputs of the regression."""
     valid_share: float
     """Share of the ticks at which one of its slots is valid."""
     alone: ProbeScore
     beside: ProbeScore
-    """With all inputs that are known without features; results are ranked by it."""
+    """The score with all inputs that are known without features; results are ranked by it."""
 
 
 @dataclass(frozen=True, eq=False)
 class Known:
-    """The inputs known without features, up to one more block, and how well they predict."""
+    """The inputs known without features, up to one of their blocks, and how well they predict."""
 
     name: str
     inputs: int
@@ -59,7 +59,7 @@ class ProbeStudy:
     folds: ProbeFolds
     mean_action: ProbeScore
     known: tuple[Known, ...]
-    """Past actions; with state; with sensor, as far as the store has them."""
+    """Past actions; then with state; then with sensor too, as far as the store has them."""
     slots: tuple[ProbeResult, ...]
     """In the store's order."""
     groups: tuple[ProbeResult, ...]
@@ -79,14 +79,14 @@ class Recommendation:
     """The choice of layer, norm and pooling that the evidence supports."""
 
     reading: Literal["beside", "alone"]
-    """The scores it rests on: `beside` where a choice gains beside what is known, else `alone`."""
+    """The scores it rests on: `beside` if a choice adds to what is known, else `alone`."""
     best: ProbeResult
-    """With the highest score of those that gain."""
+    """The group with the highest score of those that gain."""
     chosen: ProbeResult
     """Of `best` and those tied with it, the one with the fewest slots, then the lowest layer, which
     costs the least."""
     tied: tuple[ProbeResult, ...]
-    """The others that gain and do not differ from `best`."""
+    """The other groups that gain and are tied with `best`."""
 
 
 def probe(store: FeatureStore, params: ProbeParams) -> ProbeStudy:
@@ -94,11 +94,11 @@ def probe(store: FeatureStore, params: ProbeParams) -> ProbeStudy:
 
     Each slot and each choice of layer, norm and pooling is scored alone, and beside the inputs that
     are known without features: the actions of the ticks before, and the last, mean and spread of
-    the causal windows of state and sensor. Each of these blocks has its own penalty, chosen in
-    their order. Folds hold whole recordings and are dealt `params.repeats` times. Each of
-    `params.threads` threads has one slot or group in memory, which grows with `params.max_ticks`.
-    The same store and params give the same bits for any number of threads. A bar shows the progress
-    on a terminal.
+    the causal windows of state and sensor. Each of these blocks has its own penalty; they are
+    chosen one after the other. Folds hold whole recordings and are dealt `params.repeats` times.
+    Each of `params.threads` threads has one slot or group in memory, which grows with
+    `params.max_ticks`. The same store and params give the same bits for any number of threads. A
+    bar shows the progress on a terminal.
 
     Raises `StoreMismatch` where fewer than two recordings are long enough, and `NumericsError` on
     NaN or inf, naming the place.
@@ -139,7 +139,7 @@ def probe(store: FeatureStore, params: ProbeParams) -> ProbeStudy:
             beside=score(inputs, beside=True),
         )
 
-    # A slot a thread, and linear algebra on that thread: the same bits, whatever the threads.
+    # Each slot and its linear algebra stay on one thread: the same bits for any number of threads.
     with threadpool_limits(1, "blas"), ThreadPoolExecutor(params.threads) as pool:
         mean_action = score(np.empty((len(folds.ticks), 0)))
         for name, block in _known_blocks(store, folds.ticks, fold, params):
@@ -181,7 +181,7 @@ def _targets(action: NDArray[np.float32], folds: ProbeFolds, horizon: int) -> In
 
 
 def ranked(results: Sequence[ProbeResult]) -> list[ProbeResult]:
-    """The best first."""
+    """The results, the best first."""
     return sorted(results, key=lambda result: result.beside.mean, reverse=True)
 
 
@@ -190,8 +190,8 @@ def recommend(study: ProbeStudy) -> Recommendation | None:
 
     A group gains where the interval of its R^2 is above 0, and where it is better than the inputs
     known without features and than the mean action. "Better" means that the interval of the
-    difference is above 0. A group is tied with the best where the best is not better and the group
-    keeps half of its gain: with few recordings, wide intervals alone would tie anything.
+    difference is above 0. A group is tied with the best if the best is not better and the group has
+    at least half of its gain: with few recordings, wide intervals alone would tie anything.
     """
     readings: tuple[Literal["beside", "alone"], ...] = ("beside", "alone")
     for reading in readings:

@@ -12,13 +12,13 @@ from pipeline.evaluate.figures import Figure, rounded
 from pipeline.evaluate.probe.study import ProbeResult, ProbeStudy, ranked, recommend
 
 TOP = 12
-"""Slots that are printed; the tables have all."""
+"""The most slots that are printed; the tables have all."""
 
 
 def write_tables(folder: Path, study: ProbeStudy) -> list[Path]:
     """Write metrics.json, slots.csv and groups.csv, the best first, and targets.csv.
 
-    The last has R^2 by channel and step of the chunk, of the baseline and of each group.
+    targets.csv has R^2 by channel and step of the chunk, for the baseline and for each group.
     """
     of_groups = ("slots", "channels", "inputs")
     slots = [_row(study, result) for result in ranked(study.slots)]

@@ -26,10 +26,10 @@ _SHOWN = ("python", "torch", "transformers", "peft", "zarr", "numpy", "av", "dvc
 
 
 def examine(params: Params) -> Generator[tuple[str, list[Issue]]]:
-    """Each group's title and issues, one after the other; what cannot be looked at is an issue.
+    """Each group's title and issues, one after the other; a check that fails is an issue too.
 
-    A group is imported when its turn comes, so that a broken or missing package is an issue and not
-    the end.
+    A group is imported when its turn comes, so a broken or missing package is an issue and does not
+    end the examination.
     """
     for title, (module, function) in GROUPS.items():
         try:
@@ -41,17 +41,17 @@ def examine(params: Params) -> Generator[tuple[str, list[Issue]]]:
 
 
 def ok(subject: str, message: str) -> Issue:
-    """It is as it should be."""
+    """An issue that says that the subject is as it should be."""
     return Issue(severity="ok", kind=subject, message=message)
 
 
 def note(subject: str, message: str, remedy: str = "") -> Issue:
-    """It works, but could be better; or it will be needed later."""
+    """An issue about what works but could be better, or what will be needed later."""
     return Issue(severity="note", kind=subject, message=message, remedy=remedy)
 
 
 def missing(subject: str, message: str, remedy: str) -> Issue:
-    """Without it a stage of the default pipeline does not run with these params."""
+    """An issue about what a stage of the default pipeline needs to run with these params."""
     return Issue(severity="error", kind=subject, message=message, remedy=remedy)
 
 
@@ -62,7 +62,7 @@ def describe(title: str, issues: Sequence[Issue]) -> list[str]:
         severity = "missing" if issue.severity == "error" else issue.severity
         head = f"  {severity:<8} {issue.kind:<18} ".ljust(_INDENT)
         for begin, text in ((head, issue.message), (f"{'-> ':>{_INDENT}}", issue.remedy)):
-            # A path or an option is copied, so it is never broken.
+            # Users copy paths and options, so these are never broken.
             wrapper = textwrap.TextWrapper(
                 WIDTH, begin, " " * len(begin), break_long_words=False, break_on_hyphens=False
             )

@@ -16,12 +16,12 @@ from pipeline.look.doctor import missing, note, ok
 
 _WHEEL = "pip install --upgrade --force-reinstall --only-binary av av"
 _EPISODES = 4
-"""Read of each source."""
+"""The most episodes that are read of each source."""
 _VIDEOS = {".mp4", ".mkv", ".avi", ".mov", ".webm"}
 
 
 def check_recordings(params: Params) -> Iterator[Issue]:
-    """`data.root` and each source; metadata is read, a few episodes, and one frame of a video."""
+    """Check `data.root` and each source: its metadata, a few episodes, and one frame of a video."""
     data = params.data
     demo = f"{command('demo')} (or dvc repro)" if data.root == params.demo.recordings else ""
     relative = any(not Path(path).is_absolute() for source in data.sources for path in source.paths)
@@ -61,7 +61,7 @@ def check_source(source: Source, opened: Opened, on_bad: str) -> Iterator[Issue]
 
 
 def _unreadable(recordings: Sequence[Recording]) -> Iterator[str]:
-    """Why those of a few evenly spread ones cannot be read that cannot."""
+    """Reads a few evenly spread recordings; yields why one cannot be read."""
     spread = np.linspace(0, len(recordings) - 1, min(_EPISODES, len(recordings)))
     for recording in (recordings[int(place)] for place in spread):
         try:

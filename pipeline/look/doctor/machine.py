@@ -1,4 +1,4 @@
-"""Whether torch can use the GPU, and whether the vision-language model is here, whole, and fits."""
+"""Whether torch can use the GPU, and whether the vision-language model is here, whole and fits."""
 
 import math
 import os
@@ -30,7 +30,7 @@ _DRIVERS = ("/proc/driver/nvidia/version", "/dev/kfd")
 """Files of an NVIDIA and of an AMD driver."""
 _EXAMPLE = "set vlm.checkpoint to a folder or a hub id, such as Qwen/Qwen2.5-VL-3B-Instruct"
 _BESIDE = 2 * 2**30
-"""About what else a GPU holds while the model works: CUDA itself and a batch's activations."""
+"""Bytes that a GPU needs beside the weights, roughly: for CUDA and a batch's activations."""
 
 
 @dataclass(frozen=True)
@@ -70,7 +70,7 @@ def usable_device(name: str) -> torch.device | None:
 
 def read_gpus() -> tuple[GPU, ...]:
     """The GPUs that torch sees."""
-    # A count of 0 without a warning where the driver does not answer.
+    # If the driver does not answer, the count is 0, without a warning.
     if not (torch.cuda.device_count() and torch.cuda.is_available()):
         return ()
     seen = [torch.cuda.get_device_properties(at) for at in range(torch.cuda.device_count())]
@@ -79,7 +79,7 @@ def read_gpus() -> tuple[GPU, ...]:
 
 
 def check_gpus(gpus: Sequence[GPU], driver: bool, dtype: str) -> Iterator[Issue]:
-    """Torch's build and the GPUs it sees; where it sees none, why."""
+    """Torch's build and the GPUs it sees; if it sees none, why."""
     built_for = {"CUDA": torch.version.cuda, "ROCm": torch.version.hip}
     made_for = [f"{name} {version}" for name, version in built_for.items() if version]
     build = f"torch {torch.__version__}, built for {', '.join(made_for) or 'the CPU only'}"
@@ -113,7 +113,7 @@ def check_attention(vlm: VLMParams, device: torch.device) -> Issue:
 
 
 def check_checkpoint(params: Params) -> Iterator[Issue]:
-    """`vlm.checkpoint` and `vlm.adapter`; nothing is downloaded, no weight is read."""
+    """Check `vlm.checkpoint` and `vlm.adapter`; nothing is downloaded, no weight is read."""
     vlm = params.vlm
     folder = local_folder(vlm.checkpoint, vlm.revision)
     if folder is None:
@@ -143,7 +143,7 @@ def check_checkpoint(params: Params) -> Iterator[Issue]:
 
 
 def local_folder(checkpoint: str, revision: str | None) -> Path | None:
-    """The folder of a checkpoint on this machine, own or in the hub's cache; None without."""
+    """The folder of a checkpoint on this machine, or in its cache of the hub; None without."""
     if folder := checkpoint_folder.folder_here(checkpoint):
         return folder
     if not checkpoint_folder.could_be_hub_id(checkpoint):
@@ -163,7 +163,7 @@ def absent_checkpoint(params: Params) -> Issue:
 
 
 def check_adapter(adapter: str) -> Issue:
-    """`vlm.adapter`."""
+    """Check `vlm.adapter`."""
     try:
         folder = local_folder(adapter, None)
         if folder is None:

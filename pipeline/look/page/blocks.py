@@ -21,10 +21,10 @@ class Text:
 
 @dataclass(frozen=True)
 class Picture:
-    """A figure: in the page as SVG that follows light and dark, beside it as `<name>.png`."""
+    """A figure: an SVG in the page, which follows light and dark, and `<name>.png` beside it."""
 
     name: str
-    """File stem, once in a report."""
+    """File stem, unique in a report."""
     caption: str
     """What it shows and how to read it; also for screen readers."""
     draw: Callable[[], Figure]
@@ -34,7 +34,8 @@ class Picture:
 class Issues:
     """What looks wrong; times are seconds as the page counts them.
 
-    The page shows the same issue at several places once (`group_issues`), and `none` without any.
+    If one issue occurs at several places, the page shows it once (`group_issues`). If there are no
+    issues, it shows `none`.
     """
 
     issues: Sequence[Issue]

@@ -11,10 +11,10 @@ FINDINGS = "findings.csv"
 
 
 def group_issues(issues: Sequence[Issue]) -> list[list[Issue]]:
-    """Issues of one severity, kind and stream together: errors first, then what shows most often.
+    """Groups of issues of one severity, kind and stream: errors first, then the largest groups.
 
-    The message of the first stands for its group. `episode` becomes the name of the place: with its
-    source, where there are several.
+    The first message stands for its group. `episode` becomes the name of the place, with the source
+    if there are several sources.
     """
     several = len({issue.source for issue in issues}) > 1
     groups: dict[tuple[Severity, str, str], list[Issue]] = defaultdict(list)
@@ -46,7 +46,7 @@ def place_of(issue: Issue) -> str:
 
 
 def findings_csv(issues: Sequence[Issue]) -> str:
-    """A line an issue for programs, in the order and with the times of the page."""
+    """A line for each issue, for programs, in the order and with the times of the page."""
     heads = ("severity", "kind", "stream", "episode", "start_s", "stop_s", "message")
     rows: list[tuple[str, ...]] = []
     for issue in (issue for group in group_issues(issues) for issue in group):

@@ -1,8 +1,8 @@
 """What all pictures share: colours, fonts, and how they become files.
 
-The same numbers give the same bytes. Colours are of Okabe and Ito's palette, which colour-blind
-readers can tell apart. Neutral shapes are drawn in `INK` or `GRID` alone: a page exchanges these
-for its own colours, in light and in dark.
+The same numbers give the same bytes. The colours are from Okabe and Ito's palette, which
+colour-blind readers can tell apart. Neutral shapes are drawn only in `INK` or `GRID`: a page
+replaces these by its own colours, in light and in dark.
 """
 
 import re
@@ -30,13 +30,13 @@ INK = "#333333"
 GRID = "#dddddd"
 """Grid lines, and areas behind data."""
 PALETTE = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00")
-"""Okabe and Ito's colours without those that are lost on white or on black."""
+"""Okabe and Ito's colours without those that cannot be seen on white or on black."""
 _CJK = (
     *("Noto Sans CJK KR", "Noto Sans CJK JP", "Noto Sans CJK SC"),
     *("NanumGothic", "Malgun Gothic", "Microsoft YaHei", "Yu Gothic"),
     *("Apple SD Gothic Neo", "Hiragino Sans", "PingFang SC"),
 )
-"""Fonts of Debian, Windows and macOS with Chinese, Japanese and Korean letters."""
+"""Fonts of Debian, Windows and macOS that have Chinese, Japanese and Korean letters."""
 NO_FONT = (
     "PNG files show boxes for letters that no font of this machine has. Install one that has them, "
     "as fonts-noto-cjk of Debian and Ubuntu has Chinese, Japanese and Korean."
@@ -45,9 +45,9 @@ _NO_GLYPH = re.compile(rf"Glyph \d+ |{re.escape(NO_FONT)}")
 
 
 def families() -> list[str]:
-    """The fonts of this machine in which letters are looked up, in this order."""
+    """The fonts of this machine in which matplotlib looks for letters, in this order."""
     if not set(_CJK) & set(font_manager.get_font_names()):
-        # Matplotlib remembers its list, which may be older than a font.
+        # Matplotlib caches its list of fonts, which may be older than a font.
         listed = {font.fname for font in font_manager.fontManager.ttflist}
         for path in sorted(set(font_manager.findSystemFonts()) - listed):
             with suppress(OSError, RuntimeError, ValueError, KeyError):
@@ -60,9 +60,9 @@ RC: dict[Any, Any] = {
     "figure.constrained_layout.use": True,
     **dict.fromkeys(("text.color", "axes.edgecolor", "axes.labelcolor"), INK),
     **dict.fromkeys(("xtick.color", "ytick.color", "hatch.color"), INK),
-    # A name from a recording is no TeX, whatever dollars it has.
+    # A name from a recording is never TeX, even with dollar signs.
     "text.parse_math": False,
-    # Without it the ids inside an SVG are random.
+    # Without this the ids inside an SVG are random.
     "svg.hashsalt": "pipeline",
     # Only fonts that exist: matplotlib warns of every other.
     "font.family": families(),
@@ -79,7 +79,7 @@ RC: dict[Any, Any] = {
 def write(folder: Path, pictures: Mapping[str, Callable[[], Figure]]) -> list[Path]:
     """Draw each picture in the common style, save it by its name and return the paths.
 
-    Warns once, with `NO_FONT`, of letters that cannot be drawn. Raises `DiskFull`.
+    Warns once, with `NO_FONT`, if letters cannot be drawn. Raises `DiskFull`.
     """
     with mpl.rc_context(RC), boxes() as notes:
         for name, draw in pictures.items():
@@ -94,7 +94,7 @@ def write(folder: Path, pictures: Mapping[str, Callable[[], Figure]]) -> list[Pa
 
 @contextmanager
 def boxes() -> Generator[set[str]]:
-    """A set that gets `NO_FONT` once a letter was drawn as a box; replaces a warning a letter."""
+    """Yields a set that gets `NO_FONT` if a letter is drawn as a box; hides those warnings."""
     notes: set[str] = set()
     show = warnings.showwarning
 
@@ -152,7 +152,7 @@ def draw_map(
 
 
 def shorten_middle(name: str, begin: int, end: int) -> str:
-    """A name without its middle, where it is longer than both ends."""
+    """A name without its middle, if it is longer than both ends."""
     return name if len(name) <= begin + end + 1 else f"{name[:begin]}…{name[-end:]}"
 
 
@@ -162,7 +162,7 @@ def draw_strip(
     frames: Mapping[str, Sequence[NDArray[np.uint8]]],
     times_s: Sequence[float],
 ) -> None:
-    """The frames of each view as a row of `grid`, from the first, below their times."""
+    """Draw the frames of each view as a row of `grid`, from the first row, below their times."""
     for row, (view, images) in enumerate(frames.items()):
         for column, image in enumerate(images):
             axis = figure.add_subplot(grid[row, column])
@@ -174,14 +174,14 @@ def draw_strip(
 
 
 def logarithmic(axis: Axes) -> None:
-    """Powers of ten upwards, in plain numbers: matplotlib's own labels are TeX."""
+    """Make the y axis logarithmic, with plain numbers: matplotlib's own labels are TeX."""
     axis.set_yscale("log")
     axis.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
     axis.yaxis.set_minor_formatter(NullFormatter())
 
 
 def finish(figure: Figure, axis: Axes, columns: int, title: str | None = None) -> None:
-    """The legend of one axis below all panels, and a title above them."""
+    """Draw the legend of one axis below all panels, and a title above them."""
     handles, labels = axis.get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=columns)
     if title is not None:

@@ -1,4 +1,4 @@
-"""A matplotlib figure -> SVG inside a page: transparent, in the page's own ink, nothing outside."""
+"""A matplotlib figure -> SVG inside a page: transparent, in the page's ink, with no other file."""
 
 import base64
 import io
@@ -36,7 +36,7 @@ def inline_svg(figure: Figure, name: str, label: str) -> str:
         figure.savefig(written, format="svg", dpi=RASTER_DPI, transparent=True, metadata=_NONE)
     body = re.sub(r"^.*?<svg[^>]*>|</svg>\s*$", "", written.getvalue(), flags=re.DOTALL)
     width, height = POINTS_INCH * figure.get_size_inches()
-    # No wider than it was drawn. Shapes without a colour, black in SVG, take the page's ink.
+    # No wider than it was drawn. Shapes without a colour, black in SVG, get the page's ink.
     return (
         f'<svg viewBox="0 0 {width:g} {height:g}" xmlns:xlink="http://www.w3.org/1999/xlink" '
         f'fill="currentColor" style="--w:{width * POINT_PX:.0f};--h:{height * POINT_PX:.0f}" '
@@ -57,7 +57,7 @@ def _body(body: str, name: str) -> str:
 
 
 def _smaller(image: re.Match[str]) -> str:
-    """A camera's frame as JPEG; curves, maps and what is partly transparent as they are."""
+    """A camera's frame as JPEG; curves, maps and partly transparent images unchanged."""
     png = base64.b64decode(image[1])
     with Image.open(io.BytesIO(png)) as decoded:
         alpha = decoded.getchannel("A").getextrema() if "A" in decoded.getbands() else (255, 255)

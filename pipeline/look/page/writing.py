@@ -1,7 +1,7 @@
-"""`Report` -> `report.html`, one file that needs nothing beside itself, and PNG files.
+"""`Report` -> `report.html`, one file that needs no other file, and PNG files.
 
-The page makes no request: styles, script and pictures stand in it, and its content security policy
-forbids the rest. The same report gives the same bytes.
+The page makes no request: it contains its styles, script and pictures, and its content security
+policy forbids the rest. The same report gives the same bytes.
 """
 
 import re
@@ -31,11 +31,11 @@ from pipeline.look.page.svg import inline_svg
 
 PAGE = "report.html"
 OPEN_GROUPS = 12
-"""Groups of issues that are shown at once; the others unfold."""
+"""The most groups of issues that are shown at once; the others unfold."""
 NAMED_PLACES = 3
-"""Issues of a group that are shown at once; all of them unfold."""
+"""The most issues of a group that are shown at once; all of them unfold."""
 MOST_PLACES = 300
-"""Issues of a group in the page; `findings.csv` has all."""
+"""The most issues of a group in the page; `findings.csv` has all."""
 _WRITTEN = re.compile(r'<meta name="pictures" content="([^"]*)">')
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*")
 _TEMPORARY = OutputKind("a page in the making", Path.is_dir)
@@ -44,11 +44,11 @@ _TEMPORARY = OutputKind("a page in the making", Path.is_dir)
 def write_report(folder: Path, report: Report) -> list[Path]:
     """Write `report.html` and `<name>.png` of every picture into `folder`; return their paths.
 
-    A page with issues has all of them in `findings.csv` beside it. Pictures are drawn one at a
-    time. Each file is put in place whole, the page last, so that a kill leaves the old page.
-    Pictures of the old page that this one lacks are removed; no other file in `folder` is touched.
-    The caller has checked that the folder may be written to. Raises `DiskFull` with the old page in
-    place, and `ValueError` for a picture's name that is twice in the report or no plain file stem.
+    All issues of a page are also in `findings.csv` beside it. Pictures are drawn one at a time.
+    Each file is put in place whole, the page last, so a kill leaves the old page. Pictures of the
+    old page that this one lacks are removed; no other file in `folder` is touched. The caller must
+    have checked that the folder may be written to. Raises `DiskFull` with the old page in place,
+    and `ValueError` if a picture's name is twice in the report or not a plain file stem.
     """
     names = [picture.name for picture in report.blocks(Picture)]
     if len(set(names)) < len(names) or not all(map(_NAME.fullmatch, names)):
@@ -63,7 +63,7 @@ def write_report(folder: Path, report: Report) -> list[Path]:
             if issues := next(report.blocks(Issues), None):
                 texts = {FINDINGS: findings_csv(issues.issues), **texts}
             for name, text in texts.items():
-                # A file's name need not be text: other bytes are shown as \udcXX.
+                # A file's name may have bytes that are not text: they are shown as \udcXX.
                 (temporary / name).write_text(text, encoding="utf-8", errors="backslashreplace")
             return _put_in_place(temporary, folder, [*(f"{name}.png" for name in names), *texts])
         finally:
@@ -144,7 +144,7 @@ class _PageWriter:
 
 
 def sentence(words: str) -> str:
-    """Words of a table or a terminal as a sentence, with a capital and a full stop."""
+    """Words of a table or a terminal as a sentence, with a capital letter and a full stop."""
     return f"{words[0].upper()}{words[1:]}."
 
 

@@ -1,1 +1,1 @@
-"""Recordings: a file a topic with its facts, what looks wrong in it, its picture and section."""
+"""Recordings: each topic has a file with its facts, its issues, its picture and its section."""

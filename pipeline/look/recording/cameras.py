@@ -7,11 +7,11 @@ A long episode costs no more than a short one:
 - Videos and pictures in rows: all frames of an episode of up to `MOST_FRAMES`, else `RUNS` runs of
   neighbours, evenly spread. The packets of a whole video are read in any case.
 
-Equal pictures prove a frozen camera only where its pictures have noise: where most pixels differ
-between neighbours, also just before and after equal ones. The pictures of a simulation, and of a
-video whose encoder skips what stands still, are equal whenever nothing moves; there a camera counts
-as frozen when every other camera of the episode sees something move meanwhile, and a single camera
-only when it never changes at all.
+Equal pictures prove a frozen camera only if its pictures have noise: if most pixels differ between
+neighbours, also just before and after equal ones. The pictures of a simulation, and of a video
+whose encoder skips what stands still, are equal whenever nothing moves. Such a camera counts as
+frozen if every other camera of the episode sees something move meanwhile; a single camera counts as
+frozen only if it never changes at all.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -70,8 +70,8 @@ def read_frames(
 ) -> tuple[dict[str, list[NDArray[np.uint8]]], tuple[Issue, ...]]:
     """By view, the last frame (height, width, 3) RGB at or before each of these rising ticks.
 
-    And an issue `unreadable` for each view that is left out because a frame cannot be read; a file
-    may vanish after `find_frame_issues` looked at it.
+    Also an issue `unreadable` for each view that is left out because a frame cannot be read; a file
+    may vanish after `find_frame_issues` has read it.
     """
     frames: dict[str, list[NDArray[np.uint8]]] = {}
     broken: list[Issue] = []
@@ -112,8 +112,8 @@ def _shown_at(view: EpisodeView, name: str, ticks: Sequence[int]) -> NDArray[np.
 class _Compared:
     """The frames of a camera, compared.
 
-    `index` (frame,) are the compared frames, `equal` (frame - 1,) is set where a frame equals the
-    one before; `blank` says by frame whether it is of one colour, of the frames that were checked.
+    `index` (frame,) are the compared frames; `equal` (frame - 1,) is set where a frame equals the
+    one before; `blank` says for each checked frame whether it is of one colour.
     """
 
     index: NDArray[np.int64]
@@ -166,7 +166,7 @@ def _is_blank(frame: NDArray[np.uint8]) -> bool:
 
 
 def _share_differing(before: NDArray[np.uint8], after: NDArray[np.uint8]) -> float:
-    """Share of pixels that differ; all of them where sizes do."""
+    """Share of pixels that differ; 1 if the sizes differ."""
     return float((before != after).any(axis=2).mean()) if before.shape == after.shape else 1.0
 
 
@@ -179,7 +179,7 @@ def _beside(camera: CameraStream, equal: NDArray[np.bool_]) -> Iterator[float]:
 
 
 def _spread_runs(frames: int, most: int) -> NDArray[np.int64]:
-    """All frames where they are few, else `RUNS` runs of neighbours, evenly spread."""
+    """All frames if they are at most `most`, else `RUNS` runs of neighbours, evenly spread."""
     if frames <= most:
         return np.arange(frames)
     length = most // RUNS
@@ -229,7 +229,7 @@ def _duplicates(view: EpisodeView, name: str, compared: Mapping[str, _Compared])
 def _others_move(
     view: EpisodeView, name: str, compared: Mapping[str, _Compared], start_s: float, stop_s: float
 ) -> bool:
-    """Whether there are other cameras, and the pictures of each change between two instants."""
+    """Whether there are other cameras, and each of them sees changes between two instants."""
     moving: list[int] = []
     for other in compared.keys() - {name}:
         time = view.cameras[other].time[compared[other].index]

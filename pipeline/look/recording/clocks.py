@@ -1,7 +1,7 @@
 """When each stream was sampled: rates, jitter and gaps, what looks wrong in them, and their lanes.
 
-A step is a gap from `GAP_FACTOR` usual steps on: one entry lost from a jittering clock (two steps
-and the jitter) is no gap, two lost in a row are.
+A step of `GAP_FACTOR` usual steps or more is a gap: one entry lost from a jittering clock (two
+steps and the jitter) is no gap, two entries lost in a row are one.
 """
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -23,34 +23,34 @@ from pipeline.look.page.blocks import Block
 from pipeline.look.page.style import GRID, INK, PALETTE, panels
 from pipeline.look.recording.episode import Draw, EpisodeView
 
-# Usual steps from which a step is a gap.
+# A step of so many usual steps or more is a gap.
 GAP_FACTOR = 2.5
-# Usual steps from which a camera's step has lost a frame.
+# In a step of so many usual steps or more, a camera has lost a frame.
 DROPPED_STEP = 1.5
-# Least number of such steps, and the share of all steps that they exceed, as do the frames that
-# there was time for: jitter alone leaves no time, as steps get shorter too.
+# Least number of such steps, and the share of all steps that they must exceed. The frames for which
+# there was time must exceed it too: jitter alone leaves no time, as it also makes steps shorter.
 DROPPED, DROPPED_SHARE = 5, 0.05
 # How late a stream may begin, or how early end: the smaller of seconds and a share of the episode,
 # but at least so many ticks and `DROPPED_STEP` of its own steps.
 LOST_S, LOST_SHARE, LOST_TICKS = 0.5, 0.05, 2.5
 
-# Share of the mean step under which a median step means stamps in bursts.
+# If the median step is below this share of the mean step, entries are stamped in bursts.
 _BURSTS = 0.5
 # Share of the rising steps that may be gaps and are left out of the mean.
 _LONGEST = 0.02
-# Seconds between the ticks of an episode without two.
+# Seconds between ticks, for an episode with fewer than two ticks.
 _TICK_S = 0.1
-# Share of entries that have the time of the one before, above which it is told.
+# Repeated times are an issue if more than this share of entries has the time of the one before.
 REPEATED = 0.05
-# Steps from which frames can be called dropped.
+# Fewest steps for frames to be called dropped.
 _FEWEST = 20
 
 _GAP_COLOUR = "#D55E00"
-# Colour of a stroke, in the order of the lanes: what feeds a lane stands above it.
+# Colour of a stroke, in the order of the lanes: a lane is below those that feed it.
 _KINDS = {"stream": PALETTE[4], "camera": PALETTE[0], "vl_row": PALETTE[2], "tick": INK}
-# Strokes that a lane has room for: of nearer entries, only one is drawn.
+# A lane has room for so many strokes: of entries that are nearer, only one is drawn.
 _STROKES = 1500
-# VL rows of the lower picture, and its seconds without any.
+# VL rows in the lower picture, and its seconds if there are none.
 _ROWS_NEAR, _NEAR_S = 5, 1.5
 # How far the marks of a lane reach up and down.
 _HALF = 0.36
@@ -100,7 +100,7 @@ class Clock:
 
     @cached_property
     def gaps(self) -> tuple[Gap, ...]:
-        """Where it skips, in order."""
+        """The gaps, in order."""
         places = np.flatnonzero(np.diff(self.time) >= self.shortest_gap_s)
         return tuple(Gap(float(self.time[at]), float(self.time[at + 1])) for at in places)
 
@@ -138,8 +138,8 @@ def read_clocks(view: EpisodeView) -> list[Clock]:
 def usual_step(time: NDArray[np.float64]) -> float:
     """The step of a clock in seconds, NaN for fewer than two entries.
 
-    The median; where entries are stamped in bursts, which have steps of zero and long ones, the
-    mean without the longest 2 % of the rising steps, which may be gaps; 0 where times only repeat.
+    It is the median. If entries are stamped in bursts, with steps of zero and long ones, it is the
+    mean without the longest 2 % of the rising steps, which may be gaps; 0 if times only repeat.
     """
     return _usual(time)[0]
 
@@ -161,7 +161,7 @@ def _usual(time: NDArray[np.float64]) -> tuple[float, float]:
 def _merge_equal(clocks: Iterable[Clock]) -> list[Clock]:
     """The clocks; those with the very same times become one whose name lists theirs.
 
-    So a gap in the rows of a LeRobot episode is one gap, not one of each view and stream.
+    So a gap in the rows of a LeRobot episode is one gap, not one for each view and stream.
     """
     alike: dict[bytes, list[Clock]] = {}
     for clock in clocks:
@@ -201,10 +201,10 @@ def _describe_gap(
 
 
 def _ends_apart(clock: Clock, gap: Gap, recorded: Sequence[Clock]) -> tuple[float, float] | None:
-    """Seconds from its end to the nearest clock without such a gap, and the same less the gap.
+    """Seconds from the clock's end to the nearest end of a clock without such a gap.
 
-    None where entries are missing: such a clock ends with the others, a clock that was set does not
-    end with them, and would without the jump.
+    The second number is the same without the gap. None if entries are missing: then the clock ends
+    with the others. A clock that was set does not end with them, but would without the jump.
     """
     ends = [c.time[-1] for c in recorded if c.longest_step_s < gap.length_s / 2]
     if not ends:
@@ -220,7 +220,7 @@ def _dropped(view: EpisodeView, clock: Clock) -> Iterator[Issue]:
     steps = np.diff(clock.time)
     small = steps < clock.shortest_gap_s
     begun, steps = clock.time[:-1][small], steps[small]
-    # Stamps in bursts have long steps between them and lack nothing.
+    # Between bursts of stamps, steps are long although no frame is missing.
     if len(steps) < _FEWEST or clock.step_s > float(np.median(steps)):
         return
     places = np.flatnonzero(steps >= DROPPED_STEP * clock.step_s)
@@ -266,7 +266,7 @@ def _tick_s(view: EpisodeView) -> float:
 
 
 def clock_blocks(view: EpisodeView, draw: Draw, params: Params) -> list[Block]:
-    """The lanes and a table of all clocks, the ticks' and VL rows' too; empty without any."""
+    """The lanes and a table of all clocks, including ticks and VL rows; empty without any."""
     clocks = read_clocks(view)
     if not clocks:
         return []
@@ -294,10 +294,10 @@ def clock_table(view: EpisodeView, clocks: Sequence[Clock]) -> Table:
 
 
 def draw_lanes(view: EpisodeView) -> Figure:
-    """A lane a clock: over the whole episode above, about five VL rows below.
+    """A lane for each clock: the whole episode above, about five VL rows below.
 
-    Below, lines lead from each frame to the VL row that took it, and from the row to the ticks that
-    reuse it. Streams with the very same times share a lane.
+    In the lower picture, lines lead from each frame to the VL row that took it, and from the row to
+    the ticks that reuse it. Streams with exactly the same times share a lane.
     """
     recorded = [clock for clock in read_clocks(view) if len(clock.time)]
     streams = _merge_equal(clock for clock in recorded if clock.kind == "stream")
@@ -338,7 +338,7 @@ def _choose_near(
 
 
 def _draw_lane(axis: Axes, clock: Clock, lane: int, zero: float) -> None:
-    """A stroke an entry, where there is room, and the gaps."""
+    """Draw a stroke for each entry, as far as there is room, and the gaps."""
     low, high = axis.get_xlim()
     time = clock.time[(clock.time >= low + zero) & (clock.time <= high + zero)] - zero
     places = ((time - low) / (high - low) * _STROKES).astype(np.int64)
@@ -355,7 +355,7 @@ def _draw_lane(axis: Axes, clock: Clock, lane: int, zero: float) -> None:
 def _draw_reuse(
     axis: Axes, line: Timeline, zero: float, lanes: Mapping[str, int], near: tuple[float, float]
 ) -> None:
-    """Lines from frames to the VL rows that took them, and from VL rows to the ticks they serve."""
+    """Draw lines from frames to the VL rows that took them, and from these to their ticks."""
     ticks = np.flatnonzero((line.time >= near[0]) & (line.vl_time[line.vl_row] <= near[1]))
     rows, row_lane = np.unique(line.vl_row[ticks]), lanes["VL rows"]
     for name, time in line.frame_time.items():

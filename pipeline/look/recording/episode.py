@@ -29,9 +29,9 @@ BROKEN = (RecordingError, OSError)
 class EpisodeView:
     """One recording with every part that could be read.
 
-    A part that could not is None, or absent from `cameras`, and an issue of kind `unreadable` says
-    why. `action` is as recorded, `timeline.action` is at the ticks; `zero` is the first instant of
-    all clocks; `action_rotation` is how `timeline` derived actions from poses.
+    A part that could not be read is None, or absent from `cameras`, and an issue of kind
+    `unreadable` says why. `action` is as recorded, `timeline.action` is at the ticks; `zero` is the
+    first instant of all clocks; `action_rotation` is how `timeline` derived actions from poses.
     """
 
     recording: Recording
@@ -62,8 +62,8 @@ class EpisodeView:
     def shown(self) -> dict[str, Stream]:
         """The streams that a page shows, by name.
 
-        The action is that of the ticks, or as recorded without ticks; poses that are columns of the
-        state are left out.
+        The action is that of the ticks, or the recorded one if there are no ticks; poses that are
+        columns of the state are left out.
         """
         streams, line = self.streams, self.timeline
         if {"poses", "state"} <= streams.keys():
@@ -118,10 +118,10 @@ def view_episode(recording: Recording, data: DataParams, rotation: ActionRotatio
     names = ("cameras", "sensor", "state", "action", "instruction")
     parts = {name: attempt(name) for name in names}
     parts["cameras"] = parts["cameras"] or {}
-    # Poses are mostly columns of the state: a broken state is one issue, not two.
+    # Poses are mostly columns of the state: then a broken state must be one issue, not two.
     parts["poses"] = None if "state" in broken else attempt("poses")
     view = EpisodeView(recording, **parts, action_rotation=rotation)
-    # One broken file breaks every stream in it: its message stands once.
+    # One broken file breaks every stream in it: its message must be there once.
     issues = [
         view.issue(
             "unreadable", ", ".join(s for s in broken if broken[s] == message), message,
@@ -141,7 +141,7 @@ def view_episode(recording: Recording, data: DataParams, rotation: ActionRotatio
 def runs(flags: NDArray[np.bool_]) -> list[tuple[int, int]]:
     """Start and stop of each run of set flags.
 
-    Where a flag stands between an entry and the next, these are a run's first and last entry.
+    If flag i is about entries i and i + 1, these are a run's first and last entry.
     """
     edges = np.flatnonzero(np.diff(flags, prepend=False, append=False)).reshape(-1, 2)
     return [(int(start), int(stop)) for start, stop in edges]

@@ -1,8 +1,8 @@
 """All recordings: read and checked one by one, and their page.
 
-The rules and thresholds of most issues stand in `clocks`, `streams` and `cameras`; here are those
-of what is missing, and of several recordings. Most rules look for what is unlike the rest of the
-same episode, so they expect nothing of the robot.
+The rules and thresholds of most issues are in `clocks`, `streams` and `cameras`; here are those for
+missing parts and for several recordings. Most rules compare an episode with itself, so they assume
+nothing about the robot.
 """
 
 import re
@@ -53,7 +53,7 @@ ROWS = 100
 class RecordingSummary:
     """One recording in a line.
 
-    `counts` are entries by clock (`EpisodeView.clocks`), `digests` those of its motion by stream.
+    `counts` are entries by clock (`EpisodeView.clocks`), `digests` are of its motion, by stream.
     """
 
     source: str
@@ -89,9 +89,9 @@ class RecordingSummary:
 class RecordingsOverview:
     """All recordings that were opened, and everything that is wrong with them.
 
-    `summaries` stand in the order in which recordings were opened; `common` are the issues of whole
+    `summaries` are in the order in which recordings were opened; `common` are the issues of whole
     sources and of recordings that could not be opened; `rotation` is the kind of rotation that
-    `data.action_rotation` gives for these recordings.
+    `data.action_rotation` means for these recordings.
     """
 
     summaries: tuple[RecordingSummary, ...]
@@ -109,9 +109,9 @@ class RecordingsOverview:
         return tuple(sorted({view for summary in self.summaries for view in summary.frames}))
 
     def choose(self, count: int) -> tuple[int, ...]:
-        """At most `count` places in `summaries` to look at closely, in their order.
+        """Indices into `summaries` of at most `count` recordings to show in detail, ascending.
 
-        Those with most errors, then most warnings, come first; the others are evenly spread.
+        Those with most errors, then most warnings, are taken first; the others are evenly spread.
         """
         ranked = worst_first(self.summaries)
         worst = [place for place in ranked if self.summaries[place].issues][:count]
@@ -122,13 +122,13 @@ class RecordingsOverview:
 
 
 def worst_first(summaries: Sequence[RecordingSummary]) -> list[int]:
-    """Their places, those with most errors, then most warnings, first."""
+    """Indices into `summaries`: those with most errors, then most warnings, first."""
     counts = [(-summary.errors, -summary.warnings) for summary in summaries]
     return sorted(range(len(summaries)), key=counts.__getitem__)
 
 
 def survey_recordings(opened: Opened, params: Params) -> RecordingsOverview:
-    """Read and check every recording; a broken one keeps no other from being read.
+    """Read and check every recording; a broken one does not stop the others from being read.
 
     Raises `ConfigError` where poses need `data.action_hz`.
     """
@@ -151,7 +151,7 @@ def survey_recordings(opened: Opened, params: Params) -> RecordingsOverview:
             common_embodiment(embodiments, "store", "Inspect and extract them apart.")
     except StoreMismatch as error:
         common.append(Issue(severity="error", kind="embodiment", message=str(error)))
-    # Where ticks are not the recorded rows.
+    # The sources whose ticks are not the recorded rows.
     for source, note in rate_notes(rates, params.data.action_hz).items():
         note += "; with data.action_hz null the recorded rows are the ticks"
         common.append(_warning("tick rate", note, source, stream="ticks"))
@@ -176,7 +176,7 @@ def _summarise(view: EpisodeView) -> RecordingSummary:
 
 
 def find_issues(view: EpisodeView) -> tuple[Issue, ...]:
-    """The issues of this episode, those of reading it included: errors first, then by time."""
+    """The issues of this episode and of reading it: errors first, then by time."""
     issues = list(view.issues)
     try:
         nominal = view.recording.nominal()
@@ -204,7 +204,7 @@ def _missing(view: EpisodeView, nominal: Nominal) -> Iterator[Issue]:
         yield view.issue("depth view", f"view {name}", message)
     if "cameras" in unread:
         return
-    # Those that `data.views` leaves out, too.
+    # These include the views that `data.views` leaves out.
     recorded, empty = view.recording.all_views(), view.recording.empty_views()
     if not view.cameras:
         left_out = f"; data.views leaves out {', '.join(recorded)}" if recorded else ""
@@ -215,7 +215,7 @@ def _missing(view: EpisodeView, nominal: Nominal) -> Iterator[Issue]:
 
 
 def _warn_of_missing(summaries: Sequence[RecordingSummary]) -> None:
-    """Warn of what most episodes of a source and format have, where no other issue tells of it."""
+    """Warn if an episode lacks what most of its source and format have, unless already reported."""
     alike: dict[tuple[str, str], list[RecordingSummary]] = defaultdict(list)
     for summary in summaries:
         alike[summary.source, summary.format].append(summary)
@@ -223,10 +223,11 @@ def _warn_of_missing(summaries: Sequence[RecordingSummary]) -> None:
         held = Counter(name for summary in group for name in summary.counts)
         usual = {name for name, count in held.items() if 2 * count > len(group)}
         for summary in group:
-            told = {name for issue in summary.issues for name in issue.stream.split(", ")}
-            told |= {name for name in usual if name.startswith("view ") and "cameras" in told}
-            told |= {"poses"} & usual if "state" in told else set()  # its columns
-            if lacking := sorted(usual - summary.counts.keys() - told):
+            reported = {name for issue in summary.issues for name in issue.stream.split(", ")}
+            views = {name for name in usual if name.startswith("view ")}
+            reported |= views if "cameras" in reported else set()
+            reported |= {"poses"} & usual if "state" in reported else set()  # its columns
+            if lacking := sorted(usual - summary.counts.keys() - reported):
                 message = "not there; most episodes of this source have it"
                 place = summary.source, summary.episode, ", ".join(lacking)
                 summary.issues.append(_warning("missing", message, *place))
@@ -235,8 +236,8 @@ def _warn_of_missing(summaries: Sequence[RecordingSummary]) -> None:
 def _digest_motion(view: EpisodeView) -> dict[str, str]:
     """Digests of the values of state and action, or of the sensor without either.
 
-    Streams that never change are left out: they can be equal by chance. So are clocks: two formats
-    give the same rows different times.
+    Streams that never change are left out: they can be equal by chance. Clocks are left out too:
+    two formats give the same rows different times.
     """
     motion = {name: view.streams[name] for name in ("state", "action") if name in view.streams}
     streams = motion or ({} if view.sensor is None else {"sensor": view.sensor})
@@ -248,7 +249,7 @@ def _digest_motion(view: EpisodeView) -> dict[str, str]:
 
 
 def _warn_of_duplicates(summaries: Sequence[RecordingSummary]) -> None:
-    """Warn of episodes whose streams have the values of an earlier one, where both have them."""
+    """Warn of episodes that have the same values as an earlier one in all streams of both."""
     firsts: dict[tuple[str, str], list[RecordingSummary]] = defaultdict(list)
     for summary in summaries:
         for first in (first for digest in summary.digests.items() for first in firsts[digest]):
@@ -288,8 +289,8 @@ def recordings_report(opened: Opened, params: Params, name: str) -> Report:
     """The page of these recordings, which the reader knows as `name`.
 
     Every recording is read and checked, one in memory at a time; `inspect.episodes` of them are
-    shown in detail. Pictures read their recording again when they are drawn. A sentence stands in
-    for every part that cannot be shown. Raises `ConfigError` where poses need `data.action_hz`.
+    shown in detail. Pictures read their recording again when they are drawn. A sentence replaces
+    every part that cannot be shown. Raises `ConfigError` where poses need `data.action_hz`.
     """
     overview = survey_recordings(opened, params)
     summaries, chosen = overview.summaries, overview.choose(params.inspect.episodes)
@@ -299,7 +300,7 @@ def recordings_report(opened: Opened, params: Params, name: str) -> Report:
         return view_episode(opened.recordings[index], params.data, overview.rotation)
 
     def drawer(index: int, prefix: str) -> Draw:
-        # The view is read again when a picture is drawn: a long page holds one in memory.
+        # The view is read again when a picture is drawn, so a long page holds one in memory.
         return lambda name, caption, draw: Picture(
             f"{prefix}{name}", caption, lambda: draw(view_of(index))
         )

@@ -1,4 +1,4 @@
-"""What policy and model get of a recording: training samples, the batch, the prompt as tokens."""
+"""What policy and model receive from a recording: samples, the batch, the prompt as tokens."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -23,8 +23,8 @@ from pipeline.vlm.feature_spec import FeatureSpec, feature_spec
 from pipeline.vlm.preparation import Preparer
 from pipeline.vlm.processor import TokenKind
 
-# The picture fills this width unless its columns get too narrow: then its smallest text, 8 points,
-# is no smaller than 8 pixels on a page. Beside the columns stand labels and legends.
+# The picture fills this width unless its columns get too narrow: so its smallest text, 8 points, is
+# no smaller than 8 pixels on a page. Labels and legends are beside the columns.
 _WIDTH_IN, _BESIDE_IN = 10.0, 1.6
 _LEAST_COLUMN_IN, _COLUMN_IN, _PANEL_IN = 1.65, 2.5, 1.15
 _SMALL = 8
@@ -38,9 +38,9 @@ _STRETCHED = 0.05
 class Sample:
     """What a policy sees at a tick, and the actions from there on, without padding.
 
-    `frames` (height, width, 3) are by view those of the VL row that the tick reuses. `windows` are
-    by stream, (entry, channel): of `sensor` and `state` the last readings up to the tick, of
-    `action` the chunk that begins at it.
+    `frames` (height, width, 3), by view, are those of the VL row that the tick reuses. `windows`
+    (entry, channel), by stream, are the last readings up to the tick for `sensor` and `state`, and
+    for `action` the chunk that begins at the tick.
     """
 
     tick: int
@@ -69,10 +69,10 @@ def window_lengths(params: Params) -> dict[str, int]:
 def cut_samples(view: EpisodeView, params: Params) -> list[Sample]:
     """At most `inspect.samples` different samples of an episode, as training cuts them.
 
-    In order of time: the first is the episode's first tick, whose windows begin with padding, the
-    last its last, whose chunk is masked past the end; those between are drawn by `inspect.seed`.
-    Raises `RecordingError` where the episode has an error, as it has without ticks, or where a
-    frame cannot be read.
+    They are in order of time. The first is the episode's first tick, whose windows begin with
+    padding; the last is its last tick, whose chunk is masked past the end; those between are drawn
+    by `inspect.seed`. Raises `RecordingError` if the episode has an error (as one without ticks
+    has), or if a frame cannot be read.
     """
     line, lengths = view.timeline, window_lengths(params)
     errors = [issue.message for issue in view.issues if issue.severity == "error"]
@@ -106,9 +106,9 @@ def draw_samples(
 ) -> Figure:
     """The samples side by side, a column each: frames, windows, action chunk.
 
-    Windows end at their tick. Hatched are the readings that the episode had not recorded yet, and
-    the steps of a chunk past its end, which training masks. States are drawn as their change since
-    the first of the window.
+    Windows end at their tick. Readings before the episode's first, and the steps of a chunk past
+    its end, which training masks, are hatched. States are drawn as their change since the window's
+    first.
     """
     rows = named_groups({name: view.shown[name] for name in samples[0].windows})
     views = samples[0].frames
@@ -132,7 +132,7 @@ def draw_samples(
 
 
 def batch_table(samples: Sequence[Sample], lengths: Mapping[str, int]) -> Table:
-    """How much of each window and chunk is real, a row a sample."""
+    """How much of each window and chunk is real, a row for each sample."""
     streams = list(samples[0].windows)
     rows = [
         [sample.tick, *(f"{len(sample.windows[name])} of {lengths[name]}" for name in streams)]
@@ -150,7 +150,7 @@ def _draw_row(
     windows: Sequence[NDArray[Any]],
     length: int,
 ) -> None:
-    """The panels of one group of channels, a sample each, with the same values and colours."""
+    """Draw the panels of one group of channels, one for each sample, on the same scale."""
     ahead = name == "action"
     start, stop = (0.0, float(length)) if ahead else (0.5 - length, 0.5)
     limits = np.percentile(np.concatenate(windows), (1, 99.5)) if group.profile else (0, 1)
@@ -163,7 +163,7 @@ def _draw_row(
             extent = (edge, stop, len(group.indices) - 0.5, -0.5)
             axis.imshow(real.T, aspect="auto", extent=extent, vmin=limits[0], vmax=limits[1])
         elif ahead:
-            # The last is held to the end, under the hatch where it is masked.
+            # The last action is held to the end; the masked part is under the hatch.
             at = np.array([*range(len(real)), length], np.float64)
             plot_curves(axis, at, np.concatenate([real, real[-1:]]), group.names, held=True)
         else:
@@ -197,7 +197,7 @@ def _sample_title(view: EpisodeView, tick: int) -> str:
 def prompt_blocks(view: EpisodeView, params: Params, views: Sequence[str]) -> list[Block]:
     """The prompt of the episode's first VL row, or why it cannot be shown."""
     try:
-        # The digest does not change the prompt, and takes long: it reads every weight.
+        # The digest is left out: it does not change the prompt, and it would read every weight.
         spec = feature_spec(params.vlm, params.extract.dtype, views, lambda path: "")
         return show_prompt(view, params.vlm, spec)
     except PipelineError as error:

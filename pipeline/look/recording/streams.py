@@ -23,21 +23,21 @@ from pipeline.look.page.style import PALETTE, panels
 from pipeline.look.recording.clocks import Clock, usual_step
 from pipeline.look.recording.episode import Draw, EpisodeView, runs
 
-# A sensor whose channels all repeat for as long is frozen.
+# A sensor is frozen if all its channels repeat for so long.
 FROZEN_S = 0.5
-# An outlier is as many times as far from its neighbours as 95 % of the entries are, and farther
+# An outlier is so many times farther from its neighbours than 95 % of the entries are, and farther
 # than all others are apart.
 OUTLIER = 20.0
-# A clipped channel has this share of its readings at its end, and as many of them in a row.
+# A clipped channel has this share of its readings at its end, and so many of them in a row.
 CLIPPED_SHARE, CLIPPED_RUN = 0.01, 5
-# Times as many readings at the end as at the value next to it.
+# It has so many times more readings at the end than at the value next to it.
 PILED_UP = 3
-# Channels of a profile that are clipped at least: a bright echo is a few channels wide.
+# Least number of channels of a profile that are clipped: a bright echo is a few channels wide.
 TOGETHER = 3
-# A channel that begins at its end for as long rests there.
+# A channel that begins at its end for so long rests there.
 REST_S = 0.5
 
-# Entries from which values are judged.
+# Fewest entries for values to be judged.
 _FEWEST = 20
 _NEIGHBOURS = 5
 # Channels worked on at a time: sorting copies them.
@@ -48,9 +48,9 @@ _LINES = cycler(ls=("-", "--", ":")) * cycler(color=PALETTE)
 _WIDTH_IN, _PANEL_IN, _IMAGE_IN = 10.0, 1.75, 2.6
 # A group whose channels move less than this share of its span is drawn as changes.
 _STANDS_STILL = 0.2
-# Readings from which a curve is a bitmap in the page, and columns of an image.
+# A curve of more readings is a bitmap in the page; an image has so many columns.
 _BITMAP, _COLUMNS = 5000, 1200
-# Seconds that an image covers at least.
+# Least seconds that an image covers.
 _LEAST_S = 1e-3
 
 
@@ -131,7 +131,7 @@ def draw_sensor(view: EpisodeView) -> Figure:
     for axis, group in zip(axes, groups, strict=True):
         if group.profile:
             _draw_profile(axis, view.sensor, group, view.zero)
-            # Edges alone, which hide nothing of the image.
+            # Only edges, which hide nothing of the image.
             for edge in spans.ravel():
                 axis.axvline(edge, color=CONTACT_COLOUR, lw=1.4, ls="--")
             continue
@@ -146,8 +146,8 @@ def draw_sensor(view: EpisodeView) -> Figure:
 def draw_motion(view: EpisodeView) -> Figure:
     """State and poses in panels by unit, and below them the actions, held from tick to tick.
 
-    Where the channels of a panel lie so far apart that no motion would be seen, it shows their
-    change since the first reading, and the legend where each began.
+    If the channels of a panel are so far apart that no motion could be seen, the panel shows their
+    change since the first reading, and the legend shows where each began.
     """
     shown = {name: stream for name, stream in view.shown.items() if name != "sensor"}
     drawn = named_groups(shown)
@@ -170,7 +170,7 @@ def plot_curves(
     labels: Sequence[str],
     held: bool = False,
 ) -> None:
-    """Draw values (point, channel) as a curve a channel, the first 18 in different styles.
+    """Draw values (point, channel) as a curve for each channel, the first 18 in different styles.
 
     `held` holds each value until the next. Long curves are a bitmap in the page.
     """
@@ -189,7 +189,7 @@ def plot_curves(
 
 
 def legend_beside(axis: Axes) -> None:
-    """The legend of a panel, right of it; in columns where it is long."""
+    """Draw the legend of a panel to its right; in columns if it is long."""
     columns = 1 + len(axis.get_legend_handles_labels()[1]) // 8
     place: dict[str, Any] = {"loc": "center left", "bbox_to_anchor": (1.005, 0.5)}
     axis.legend(fontsize=8, ncols=columns, handlelength=1.6, **place)
@@ -211,7 +211,9 @@ def _draw_curves(
     held: bool = False,
     changes: bool = False,
 ) -> None:
-    """Curves that break at gaps of the clock; with `changes`, those that move little as changes."""
+    """Draw curves that break at gaps of the clock; with `changes`, channels that move little are
+    drawn as changes.
+    """
     values = stream.values[:, group.indices].astype(np.float64)
     labels, unit = group.names, group.label
     if changes and np.ptp(values, axis=0).max() < _STANDS_STILL * np.ptp(values):
@@ -224,9 +226,10 @@ def _draw_curves(
 
 
 def _draw_profile(axis: Axes, stream: Stream, group: ChannelGroup, zero: float) -> None:
-    """A channel of the profile a line, the first on top, in colours that ignore a few extremes.
+    """Draw a line for each channel of the profile, the first on top.
 
-    A column shows the last reading before it, and nothing at a gap of the clock.
+    The colours ignore a few extremes. A column shows the last reading before it, and nothing at a
+    gap of the clock.
     """
     clock = Clock("", "stream", stream.time)
     stop = max(stream.time[-1] + np.nan_to_num(clock.step_s), stream.time[0] + _LEAST_S)
@@ -246,9 +249,10 @@ def _draw_profile(axis: Axes, stream: Stream, group: ChannelGroup, zero: float) 
 
 
 def statistics_blocks(view: EpisodeView, draw: Draw, params: Params) -> list[Block]:
-    """A row a channel, a row for all channels of a profile; empty without any stream.
+    """A row for each channel, one row for all channels of a profile; empty without any stream.
 
-    The row of a profile has the extremes of all its channels, else the median over them.
+    The row of a profile has the least and greatest value of all its channels; its other numbers are
+    medians over them.
     """
     rows: list[tuple[object, ...]] = []
     streams = view.shown
@@ -295,7 +299,7 @@ def find_channel_issues(view: EpisodeView) -> Iterator[Issue]:
 
 
 def _unmoved(view: EpisodeView, name: str, stream: Stream) -> Iterator[Issue]:
-    """Channels of one value, and channels that hardly move beside others of their kind."""
+    """Channels that never change, and channels that hardly move compared with similar ones."""
     names, values = stream.channels.names, stream.values
     varies = np.ptp(values, axis=0) > 0
     # Many tasks never move the gripper.
@@ -316,7 +320,7 @@ def _unmoved(view: EpisodeView, name: str, stream: Stream) -> Iterator[Issue]:
 
 
 def _frozen(view: EpisodeView, sensor: Stream) -> Iterator[Issue]:
-    """Spans in which the whole sensor, or all of it but the force, repeats one reading."""
+    """Spans in which the whole sensor, or all of it except the force, repeats one reading."""
     force = force_columns(sensor.channels.names)
     columns = [column for column in range(sensor.values.shape[1]) if column not in force] or force
     if not np.ptp(sensor.values, axis=0)[columns].any():
@@ -333,14 +337,14 @@ def _repeats(values: NDArray[np.float32], columns: Sequence[int]) -> NDArray[np.
     """(reading - 1,) whether a reading equals the one before, in these columns."""
     same = np.ones(len(values) - 1, np.bool_)
     for column in columns:
-        # Only where all columns so far repeat: soon there are few such places.
+        # Compare only where all columns so far repeat: soon there are few such places.
         places = np.flatnonzero(same)
         same[places] = values[places, column] == values[places + 1, column]
     return same
 
 
 def _outliers(view: EpisodeView, name: str, entry: str, stream: Stream) -> Iterator[Issue]:
-    """Single entries that leap off and back, unlike any other of the episode."""
+    """Single entries that jump away and back, unlike any other of the episode."""
     time, values = stream.time, stream.values.astype(np.float64)
     if len(time) < _FEWEST:
         return
@@ -365,8 +369,8 @@ def _outliers(view: EpisodeView, name: str, entry: str, stream: Stream) -> Itera
 def _saturated(view: EpisodeView, sensor: Stream) -> Iterator[Issue]:
     """Channels that are clipped at the end of their range that is farther from zero.
 
-    A force rests near zero, at the other end. The channels of a profile share one converter, so one
-    range.
+    A force rests near zero, at the other end. The channels of a profile share one converter, and so
+    one range.
     """
     names, low, high = sensor.channels.names, sensor.values.min(axis=0), sensor.values.max(axis=0)
     for group in group_channels(sensor.channels):
@@ -385,7 +389,7 @@ def _saturated(view: EpisodeView, sensor: Stream) -> Iterator[Issue]:
 
 
 def _clipped(sensor: Stream, columns: Sequence[int], end: np.floating) -> list[int]:
-    """Those of these columns that stand at the end of their range, if enough are clipped there.
+    """The columns that are at the end of their range, if enough of them are clipped there.
 
     A clipped channel has far more readings at the end than at the value next to it, some in a row.
     A channel of two values is a switch, and one that begins at its end rests there.

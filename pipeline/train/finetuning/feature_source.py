@@ -73,7 +73,7 @@ class ModelFeatureSource(FeatureSource):
 
     @property
     def golden(self) -> tuple[GoldenRow, ...]:
-        """No rows: the store's have features of the model before it learned.
+        """No rows: the store's golden rows have features of the model before it learned.
 
         A head that is trained on the tuned model's own store carries that store's rows.
         """
@@ -104,7 +104,7 @@ class ModelFeatureSource(FeatureSource):
         return LiveFeed(self.store, self._rows, plan, windows, device, threads)
 
     def save(self, folder: Path, module: Trainable) -> None:
-        """Write the tuned weights, the episodes they learned from, and the feature spec they give.
+        """Write the tuned weights, the episodes they learned from, and the new feature spec.
 
         With that spec in `policy.json`, the policy fits a store that was extracted with this
         adapter or checkpoint, and not the store whose ticks it was trained on. Raises

@@ -54,7 +54,7 @@ def check_recordings(
 
 
 def check_spec(store: FeatureStore, params: Params, digests: ContentDigests) -> FeatureSpec:
-    """The feature spec of the store, which `vlm` must give.
+    """The store's feature spec, after a check that `vlm` gives the same.
 
     Raises `StoreMismatch` with the entries that differ, and `VLMError` where the checkpoint cannot
     be used.

@@ -74,15 +74,15 @@ class LiveRows:
 
 @dataclass
 class LiveBatch(Batch, LiveObservation):
-    """A batch, and the distinct rows that its features are computed from."""
+    """A batch, and the distinct rows from which its features are computed."""
 
 
 class LiveFeed(Prefetch):
-    """Hands out `(indices, live batch)` for each entry of a plan, in its order.
+    """Yields `(indices, live batch)` for each entry of a plan, in its order.
 
-    `threads` threads decode the distinct VL rows of each batch, as many batches ahead. Only plain
-    frames are decoded: other variants exist in the store alone. An exception in a recording comes
-    out of `next` at the batch it belongs to.
+    `threads` threads decode the distinct VL rows of each batch, `threads` batches ahead. Only plain
+    frames are decoded: other variants exist in the store alone. `next` raises an exception of a
+    recording at the batch it belongs to.
     """
 
     def __init__(
