@@ -145,10 +145,11 @@ def open_run(
     extra_identity: Mapping[str, Any] = NOTHING,
     section: str = "train_head",
 ) -> TrainingRun:
-    """The run of these params on this store: new, resumed or finished. It changes no run.
+    """The run of these params on this store: new, resumed or finished.
 
-    `extra_identity` is what else decides the numbers (`FeatureSource.identity`); `section` is the
-    section of the params that errors name. A finished run with a damaged checkpoint counts as new:
+    It changes nothing of a run but what a kill left half done: a replacement, and a trainer's state
+    that a finished run no longer needs. `extra_identity` is what else decides the numbers
+    (`FeatureSource.identity`); `section` is the section of the params that errors name. A finished run with a damaged checkpoint counts as new:
     it is trained again and then replaced. Raises `CheckpointMismatch` where an unfinished run with
     a checkpoint saw other features or streams, `CheckpointIncomplete` where its `run.json` is
     damaged, and `ConfigError` where no training wrote the output.
