@@ -89,9 +89,9 @@ def compute_rows(plugin: str, rows: Range) -> list[WrittenRows] | Exception:
     Raises `RecordingError` or `NumericsError` where a recording cannot be computed; dask then tries
     again. Returns an error that would stop every other row as well (no model, a full disk).
     """
-    held: ExtractionPlugin = get_worker().plugins[plugin]  # pyright: ignore[reportAssignmentType]
+    extraction: ExtractionPlugin = get_worker().plugins[plugin]  # pyright: ignore[reportAssignmentType]
     try:
-        return held.compute(rows)
+        return extraction.compute(rows)
     except (RecordingError, NumericsError):
         raise
     except Exception as error:

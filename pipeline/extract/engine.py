@@ -135,8 +135,8 @@ def _known_rows(
     """The missing rows known by content, instruction and frame times; decodes no frame."""
     for index, rows in by_episode(missing, frames.vl_start):
         episode = surveyed.episodes[index]
-        of = episode.content, episode.recording.instruction
-        keys = [(source, source.keys_of(*of)) for source in known]
+        identity = episode.content, episode.recording.instruction
+        keys = [(source, source.keys_of(*identity)) for source in known]
         for row in rows.tolist():
             for source, by_frames in keys:
                 key = by_frames.get(frames.frame_time[row].tobytes())

@@ -25,8 +25,8 @@ def plan_lines(
 
     `sources` are stores and builds of the same feature spec.
     """
-    there = {text.digest for source in sources for text in source.texts}
-    unchanged = sum(episode.digest in there for episode in surveyed.episodes)
+    known_digests = {text.digest for source in sources for text in source.texts}
+    unchanged = sum(episode.digest in known_digests for episode in surveyed.episodes)
     begun = places.begun == surveyed.plan
     place = places.part if begun or places.repaired else places.target
     before = None if read_plan(place) is None else RowSource(place)
@@ -76,8 +76,8 @@ def _reasons(
     digests = {text.digest for text in before.texts}
     changed = [episode for episode in surveyed.episodes if episode.digest not in digests]
     here = {episode.digest for episode in surveyed.episodes}
-    again = {episode.content for episode in changed}  # these count as changed
-    gone = sum(text.digest not in here and text.content not in again for text in before.texts)
+    revised = {episode.content for episode in changed}  # these count as changed
+    gone = sum(text.digest not in here and text.content not in revised for text in before.texts)
     if changed:
         what = "files, how these are read, instruction, name, place, action_hz or vlm_reuse_count"
         yield f"{len(changed)} episode(s) are new or have other {what}"
@@ -100,10 +100,10 @@ def _warnings(surveyed: Survey, before: RowSource | None, missing: int) -> Itera
     params, recordings, views = surveyed.params, surveyed.recordings, surveyed.spec.views
     known = before.attributes.feature_spec.views if before else []
     if known and (added := set(views) - set(known)):
-        having = sum(not added.isdisjoint(recording.view_names()) for recording in recordings)
+        count = sum(not added.isdisjoint(recording.view_names()) for recording in recordings)
         kept = setting("data.views", [view for view in known if view in views])
         yield (
-            f"{having} of {len(recordings)} episode(s) have {', '.join(sorted(added))}, which the "
+            f"{count} of {len(recordings)} episode(s) have {', '.join(sorted(added))}, which the "
             "store does not have. The model sees all views of a store at a time, so that every row "
             f"of every episode is computed again. To keep the rows: {kept}"
         )
@@ -139,8 +139,8 @@ def count_known(
     """How many rows of these episodes are in `sources`, by content, instruction and frame times."""
     count = 0
     for episode in checked:
-        of = episode.fields["content"], episode.fields["instruction"]
-        times = set().union(*(source.keys_of(*of) for source in sources))
+        identity = episode.fields["content"], episode.fields["instruction"]
+        times = set().union(*(source.keys_of(*identity) for source in sources))
         rows = episode.ticks.frame_times(surveyed.spec.views)
         count += sum(row.tobytes() in times for row in rows)
     return count

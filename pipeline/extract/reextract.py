@@ -111,20 +111,20 @@ def reextract(path: Path, params: Params, say: Callable[[str], None]) -> Reextra
             + "\n  ".join(describe(other))
             + "\nRun with the params that it was extracted with, or extract it anew."
         )
-    today = {episode.digest: episode.recording for episode in surveyed.episodes}
-    known = [episode for episode in store.episodes if episode.digest in today]
-    unchecked = tuple(episode.id for episode in store.episodes if episode.digest not in today)
+    current = {episode.digest: episode.recording for episode in surveyed.episodes}
+    known = [episode for episode in store.episodes if episode.digest in current]
+    unchecked = tuple(episode.id for episode in store.episodes if episode.digest not in current)
     tolerance = options.tolerance or tolerance_of(store.spec)
     stored = np.array([row for episode in known for row in episode.vl_rows], np.int64)
-    drawn = np.random.default_rng(options.seed)
-    rows = np.sort(drawn.choice(stored, min(options.reextract, len(stored)), replace=False))
+    generator = np.random.default_rng(options.seed)
+    rows = np.sort(generator.choice(stored, min(options.reextract, len(stored)), replace=False))
     if not len(rows):
         return Reextraction((), tolerance, unchecked, ())
     say(f"computing {len(rows)} rows again")
     vlm = FrozenVLM.load(params.vlm, spec, params.extract.device)
     environments = environment_runs(store.attrs["environment"], rows)
     differing = (describe(differences(then, vlm.environment)) for then, _ in environments)
-    recordings = {episode.index: today[episode.digest] for episode in known}
+    recordings = {episode.index: current[episode.digest] for episode in known}
     vl_start, frame_time = (store.array(name) for name in ("episode/vl_start", "vl/frame_time"))
     frames = RowFrames(recordings, vl_start, frame_time, spec.views)
     preparation = RowPreparation(surveyed, ())
@@ -146,8 +146,8 @@ def reextract(path: Path, params: Params, say: Callable[[str], None]) -> Reextra
 
 def _compare(store: FeatureStore, row: ReadyRow, features: NDArray[Any]) -> Deviation:
     """Compare the stored row with new features (variant x slot, dim), both in storage dtype."""
-    apart = slot_deviations(widen(store.array(FEATURES)[row.row]), widen(features))
-    slot = apart.worst
+    deviations = slot_deviations(widen(store.array(FEATURES)[row.row]), widen(features))
+    slot = deviations.worst
     same_pixels = store.array("vl/key")[row.row].tobytes() == row.key
-    absolute, relative = float(apart.absolute.max()), float(apart.relative[slot])
+    absolute, relative = float(deviations.absolute.max()), float(deviations.relative[slot])
     return Deviation(row.row, absolute, relative, slot, same_pixels, row.where)

@@ -129,8 +129,8 @@ class FeatureBlock:
 
 def known_blocks(rows: Sequence[KnownRow]) -> Iterator[FeatureBlock]:
     """Consecutive known rows of one environment as blocks."""
-    for environment, alike in groupby(rows, attrgetter("environment")):
-        block = list(alike)
+    for environment, group in groupby(rows, attrgetter("environment")):
+        block = list(group)
         features = np.stack([row.features for row in block])
         yield FeatureBlock("known", block, features, environment)
 
@@ -145,8 +145,8 @@ class RowMarks:
 
     def mark(self, written: Iterable[WrittenRows]) -> None:
         """Mark rows, grouped by environment because each mark waits for the disk."""
-        for environment, alike in groupby(written, attrgetter("environment")):
-            blocks = list(alike)
+        for environment, group in groupby(written, attrgetter("environment")):
+            blocks = list(group)
             rows = np.concatenate([block.rows for block in blocks])
             keys = [key for block in blocks for key in block.keys]
             checksums = np.concatenate([block.checksums for block in blocks])

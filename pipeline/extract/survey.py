@@ -101,8 +101,8 @@ class Survey:
         """
         extract, spec = self.params.extract, self.spec.attrs()
         by = f" on {extract.workers}" if extract.workers != 0 else ""
-        alike = {name: spec.get(name) for name in _DECIDES_SPEED} | {"views": len(spec["views"])}
-        return f"{joint_digest(json.dumps(alike, sort_keys=True))} {extract.device}{by}"
+        deciding = {name: spec.get(name) for name in _DECIDES_SPEED} | {"views": len(spec["views"])}
+        return f"{joint_digest(json.dumps(deciding, sort_keys=True))} {extract.device}{by}"
 
 
 @dataclass(frozen=True)
@@ -133,7 +133,7 @@ def survey(params: Params, digests: ContentDigests) -> Survey:
         except RecordingError as error:
             bad.append(BadEpisode(recording.source, recording.path, str(error)))
     if not episodes:
-        _refuse_bad(bad, of=len(bad))
+        _refuse_bad(bad, total=len(bad))
     spec, plan = _spec_and_plan(params, episodes, digests)
     return Survey(params, tuple(episodes), opened.missing, tuple(bad), spec, rotation, plan)
 
@@ -170,8 +170,8 @@ def sound_episodes(
     sound = [episode for episode in surveyed.episodes if episode.digest not in unusable]
     spec, plan = _spec_and_plan(surveyed.params, sound, digests)
     bad = (*surveyed.bad, *(bad for _, bad in failed))
-    again = replace(surveyed, episodes=tuple(sound), bad=bad, spec=spec, plan=plan)
-    return again, [episode for episode in checked if episode.fields["digest"] not in unusable]
+    reduced = replace(surveyed, episodes=tuple(sound), bad=bad, spec=spec, plan=plan)
+    return reduced, [episode for episode in checked if episode.fields["digest"] not in unusable]
 
 
 def check_episodes(
@@ -190,11 +190,11 @@ def check_episodes(
         try:
             sound.append(_checked(episode, surveyed, preparer))
         except RecordingError as error:
-            of = episode.recording
-            failed.append((episode, BadEpisode(of.source, of.path, str(error))))
+            recording = episode.recording
+            failed.append((episode, BadEpisode(recording.source, recording.path, str(error))))
     bad = [*surveyed.bad, *(bad for _, bad in failed)]
     if bad and (surveyed.params.data.on_bad_episode == "stop" or not sound):
-        _refuse_bad(bad, of=len(sound) + len(bad))
+        _refuse_bad(bad, total=len(sound) + len(bad))
     embodiment_of(sound)
     if surveyed.params.data.action_hz is None:
         _refuse_rates(sound)
@@ -251,13 +251,13 @@ def _checked(episode: SurveyedEpisode, surveyed: Survey, preparer: Preparer) -> 
     return checked
 
 
-def _refuse_bad(bad: Sequence[BadEpisode], of: int) -> None:
+def _refuse_bad(bad: Sequence[BadEpisode], total: int) -> None:
     """Raise one `RecordingError` that lists the first bad episodes."""
     lines: list[str] = []
     for episode in bad:
         where = "" if str(episode.where) in episode.reason else f"{episode.where}: "
         lines.append(f"  {episode.source}: {where}{episode.reason}")
-    head = f"{len(bad)} of {of} episodes cannot be used:"
+    head = f"{len(bad)} of {total} episodes cannot be used:"
     mend = "Mend or remove them, or leave them out with --set data.on_bad_episode=skip."
     raise RecordingError("\n".join([head, *capped(lines, "episodes", MOST_EPISODES), mend]))
 
