@@ -1,6 +1,6 @@
-"""What numpy lacks: bfloat16, held as its bits in uint16, and the first value that is no number.
+"""Arrays of bfloat16, held as bits in uint16, and a search for NaN and infinity.
 
-numpy and zarr do not know bfloat16. Its bits are the upper half of a float32's.
+numpy and zarr do not know bfloat16. Its bits are the upper half of those of a float32.
 """
 
 from typing import TYPE_CHECKING, Any
@@ -12,18 +12,18 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 _EXPONENTS = {"uint16": np.uint16(0x7F80), "float16": np.uint16(0x7C00)}
-"""The bits that are all set in a NaN or infinity, and in no number; numpy is slow with float16."""
+"""Exponent bits, which are all set only in NaN and infinity; numpy is slow with float16."""
 
 
 def widen(values: NDArray[Any]) -> NDArray[Any]:
-    """The numbers: uint16 bits become float32, other types stay as they are."""
+    """The values as numbers: uint16 (bfloat16 bits) becomes float32, other types stay."""
     if values.dtype != np.uint16:
         return values
     return (values.astype(np.uint32) << 16).view(np.float32)
 
 
 def array_of(tensor: "Tensor") -> NDArray[Any]:
-    """The tensor as a store holds it, on the CPU: bfloat16 becomes its bits as uint16."""
+    """The tensor as a store holds it, on the CPU: bfloat16 becomes uint16 bits."""
     import torch
 
     bits = tensor.view(torch.uint16) if tensor.dtype == torch.bfloat16 else tensor

@@ -1,8 +1,8 @@
-"""The border to files from outside: each is read once, within bounds, and refused in one form.
+"""The border for files from outside: each is read once, within bounds, and refused in one form.
 
-A document becomes a pydantic model. Whatever is wrong with it becomes one error that names the
-file, the place, the expected and the actual value, and the remedy. Each room has a `Border` with
-its own kind of error; behind it no code asks a dictionary.
+A document becomes a pydantic model. Any fault becomes one error that names the file, the place, the
+expected and the actual value, and the remedy. Each room has a `Border` with its own kind of error;
+code behind it uses the models, never a raw dictionary.
 """
 
 import gc
@@ -23,13 +23,13 @@ from pipeline.base.errors import PipelineError
 T = TypeVar("T")
 
 MOST_BYTES = 32 * 2**20
-"""Of one document; the largest usual one is a tokenizer's, with 11 MB."""
+"""Most bytes of one document; the largest usual one is a tokenizer's, with 11 MB."""
 Text = Annotated[str, Field(max_length=10_000, pattern=r"^[^\x00]*$")]
-"""A name, a path or an instruction: bounded, and without NUL, which no file system takes."""
+"""A name, path or instruction: bounded, and without NUL, which no file system allows."""
 _WEIGHTS = {b",": 1, b":": 8, b"[": 8, b"{": 8}
 MOST_WEIGHT = 4_000_000
-"""Bound on a document's values (1 each), keys and lists (8 each): pydantic keeps a refused value
-once for each problem, so a model of a dozen fields can hold 1.5 GB. A tokenizer weighs 3e6."""
+"""Limit on a document's values (1 each), keys and lists (8 each). pydantic keeps a refused value
+once per problem, so a model of a dozen fields can take 1.5 GB. A tokenizer weighs 3e6."""
 _WORDS = {
     "Extra inputs are not permitted": "unknown key",
     "Field required": "missing",
@@ -41,13 +41,13 @@ _WORDS = {
     "String should": "expected a text to",
     "Invalid JSON": "cannot be read as JSON",
 }
-"""Our words for pydantic's."""
+"""pydantic's words -> our words."""
 _MOST_TOLD = 5
 """Problems that one message lists."""
 
 
 class Document(BaseModel):
-    """Base of documents that others write: types are strict, unknown keys are ignored."""
+    """Base of documents from outside: types are strict, unknown keys are ignored."""
 
     model_config = ConfigDict(frozen=True, strict=True, extra="ignore", allow_inf_nan=False)
 
@@ -58,16 +58,16 @@ class Border:
 
     error: type[PipelineError]
     mend: str
-    """What to do, as a sentence with its full stop."""
+    """What to do about it, as one or more sentences with a full stop."""
 
     def refusal(self, where: Path | str, why: object) -> PipelineError:
-        """The error for something at a place."""
+        """The error for the file or place `where`, with the reason."""
         return self.error(f"{named(str(where))}: {str(why).rstrip('.: ')}. {self.mend}")
 
     def check_file(self, path: Path, most: int | None = None) -> int:
-        """The bytes of a regular file; refuses a folder, a pipe, a device, one of more than `most`.
+        """The size of a regular file; refuses a folder, pipe or device, and more than `most` bytes.
 
-        Opening a pipe would wait for its writer, and a device has no end.
+        To open a pipe would wait for its writer, and a device has no end.
         """
         with self.foreign(path, "cannot be read"):
             try:
@@ -89,13 +89,13 @@ class Border:
             return file.read(most)
 
     def read_json(self, path: Path, model: type[T], most: int = MOST_BYTES) -> T:
-        """The JSON document of a file, as the model; it is not followed deeper than 200 levels."""
+        """The JSON document of a file, as the model; refuses more than 200 levels."""
         return self.parse_json(self.read_bytes(path, most), model, path)
 
     def parse_json(
         self, text: bytes | str, model: type[T], where: Path | str, most: int = MOST_WEIGHT
     ) -> T:
-        """The JSON document of a text of at most that weight, as the model."""
+        """The JSON document of a text, as the model; refuses more than `most` weight."""
         raw = text.encode("utf-8", "surrogatepass") if isinstance(text, str) else text
         weight = sum(much * raw.count(mark) for mark, much in _WEIGHTS.items())
         if weight > most:
@@ -108,8 +108,8 @@ class Border:
             raise self.refusal(where, _first_problems(error)) from None
 
     def read_json_lines(self, path: Path, model: type[T], most: int = 2**20) -> Iterator[T]:
-        """The documents of a file with one on each line, each of at most `most` bytes; empty lines
-        are skipped."""
+        """The documents of a file with one per line, each of at most `most` bytes; skips empty
+        lines."""
         self.check_file(path)
         with self.foreign(path, "cannot be read"), path.open("rb") as file:
             for number, line in enumerate(iter(lambda: file.readline(most + 1), b""), start=1):
@@ -120,7 +120,7 @@ class Border:
                     yield self.parse_json(line, model, where)
 
     def parse(self, value: object, model: type[T], where: Path | str) -> T:
-        """A value that another parser has read, as the model."""
+        """A value from another parser, as the model."""
         try:
             return _adapter(model).validate_python(value)
         except ValidationError as error:
@@ -128,18 +128,18 @@ class Border:
 
     @contextmanager
     def foreign(self, where: Path | str, what: str) -> Generator[None]:
-        """Turn any error of another library inside into a refusal that begins with `what`."""
+        """Turn an error of another library inside into a refusal that begins with `what`."""
         try:
             yield
         except BaseException as error:
-            panic = type(error).__name__ == "PanicException"  # of a library in Rust: no `Exception`
+            panic = type(error).__name__ == "PanicException"  # Rust's, not an `Exception`
             if isinstance(error, PipelineError) or not (panic or isinstance(error, Exception)):
                 raise
             if isinstance(error, MemoryError):
                 mend = "Free memory, take a machine with more of it, or leave this out."
                 why = f"{what}: not enough memory for it"
                 raise Border(self.error, mend).refusal(where, why) from error
-            raised = str(error).removeprefix("Error(s) in ")  # torch's, of several
+            raised = str(error).removeprefix("Error(s) in ")  # torch's prefix for several
             said = getattr(error, "strerror", None) or f"{type(error).__name__}: {raised}"
             why = re.sub(r"<class '(\w+)'>", r"\1", f"{what}: {' '.join(str(said).split()):.300}")
             raise self.refusal(where, why.encode("utf-8", "backslashreplace").decode()) from error
@@ -147,7 +147,7 @@ class Border:
 
 @contextmanager
 def uncollected() -> Generator[None]:
-    """Pause garbage collection while a document is parsed, for which it takes most of the time."""
+    """Pause garbage collection while a document is parsed, because it takes most of the time."""
     collects = gc.isenabled()
     gc.disable()
     try:
@@ -165,7 +165,7 @@ def _first_problems(error: ValidationError) -> str:
 
 
 def problems(error: ValidationError) -> Iterator[tuple[str, str]]:
-    """The place of each problem, as in `a.b.0`, and what was expected and found there."""
+    """The place of each problem, such as `a.b.0`, and what was expected and found there."""
     for problem in error.errors(include_url=False, include_context=False):
         text = problem["msg"].removeprefix("Value error, ")
         for theirs, ours in _WORDS.items():
@@ -177,7 +177,7 @@ def problems(error: ValidationError) -> Iterator[tuple[str, str]]:
         elif not isinstance(problem["input"], dict):
             text += f", found {shown(problem['input'])}"
         elif problem["type"] not in ("missing", "extra_forbidden", "value_error"):
-            text += ", found keys with values"  # which would bury it
+            text += ", found keys with values"  # in full they would hide it
         yield named(".".join(map(str, problem["loc"]))), text
 
 
@@ -192,12 +192,12 @@ _SHORT.maxlevel, _SHORT.maxstring, _SHORT.maxother = 3, 120, 120
 
 
 def shown(value: object) -> str:
-    """A value for a message: short, and in characters that every terminal can print."""
+    """A value for a message: short, with characters that every terminal can print."""
     return _SHORT.repr(value).encode("utf-8", "backslashreplace").decode()
 
 
 def named(text: str) -> str:
-    """A name, a path or a place for a message: as it is if it can be printed."""
+    """A name, path or place for a message: unchanged if it is printable and short enough."""
     return text if len(text) <= 1000 and text.isprintable() else shown(text)
 
 

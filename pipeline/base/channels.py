@@ -1,4 +1,4 @@
-"""Channels by name and unit: which are alike, and which of those hardly move."""
+"""Channels by name and unit: which are similar, and which of those hardly move."""
 
 import re
 from collections import defaultdict
@@ -8,11 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 PROFILE_CHANNELS = 24
-"""From so many channels on that differ in a number alone, they form one profile."""
+"""This many channels, or more, that differ only in a number form one profile."""
 STILL = 0.01
-"""A standard deviation below this share of the usual one is noise."""
+"""A standard deviation below this share of the usual one counts as noise."""
 _ALIKE = 3
-"""So many moving channels make a usual spread."""
+"""A usual spread needs this many moving channels."""
 _SHOWN = 4
 _GROUP_BY_UNIT = dict.fromkeys(("m", "cm", "mm"), "translation") | {
     "deg": "rotation",
@@ -21,12 +21,12 @@ _GROUP_BY_UNIT = dict.fromkeys(("m", "cm", "mm"), "translation") | {
 
 
 def unnumbered(name: str) -> str:
-    """The name with `#` for each number: `aline_#` of `aline_0012`; the same without a number."""
+    """The name with `#` for each number: `aline_0012` gives `aline_#`."""
     return re.sub(r"\d+", "#", name)
 
 
 def named(names: Sequence[str], columns: Sequence[int]) -> str:
-    """Channels by name, neighbours as one run: `aline_0003–aline_0007, aline_0100`."""
+    """Names of channels, with neighbours as one run: `aline_0003–aline_0007, aline_0100`."""
     places = np.asarray(columns, np.int64)
     groups = np.split(places, np.flatnonzero(np.diff(places) > 1) + 1)
     ends = [(names[int(group[0])], names[int(group[-1])]) for group in groups]
@@ -49,7 +49,7 @@ def action_groups(names: Sequence[str], units: Sequence[str]) -> tuple[str, ...]
 def hardly_moving(
     std: NDArray[np.floating], names: Sequence[str], units: Sequence[str]
 ) -> dict[int, float]:
-    """Channels that vary, but far less than similar ones; with the usual spread of those.
+    """Channels that vary far less than similar ones -> the usual spread of those.
 
     `std` is (channel,), 0 where a channel does not vary.
     """
@@ -64,11 +64,11 @@ def hardly_moving(
 def usual_spread(
     std: NDArray[np.floating], names: Sequence[str], units: Sequence[str]
 ) -> NDArray[np.float64]:
-    """The usual spread of the channels similar to each, (channel,); 0 where too few are.
+    """For each channel the usual spread of similar ones, (channel,); 0 where there are too few.
 
-    `std` is (channel,), 0 where a channel does not vary. Similar channels have one unit and, but
-    for numbers, one name, such as joints. The usual spread is the upper quartile over those that
-    vary, which still channels do not lower.
+    `std` is (channel,), 0 where a channel does not vary. Similar channels, such as joints, have the
+    same unit and, apart from numbers, the same name. The usual spread is the upper quartile over
+    channels that vary, so that still channels do not lower it.
     """
     kinds: dict[tuple[str, str], list[int]] = defaultdict(list)
     for column, kind in enumerate(zip(map(unnumbered, names), units, strict=True)):

@@ -1,4 +1,4 @@
-"""Commands that a message tells its reader to run next; each runs as it is printed."""
+"""Commands that a message advises to run next; each runs as printed."""
 
 import re
 import shlex
@@ -14,18 +14,18 @@ _NOT_REPEATED = (
     "verify.repair",
     "archive.restore",
 )
-"""Keys that concern the running command alone."""
+"""Keys that concern only the running command."""
 _repeated: list[str] = []
-"""Options of the running command that the next one needs too; one list, for threads read it."""
+"""Options of the running command that the next one needs too; global, so that threads see them."""
 
 
 @contextmanager
 def running_with(params: Path, overrides: Sequence[str]) -> Generator[None]:
-    """Inside, `command` repeats this params file and these `section.key=value` settings."""
+    """Within this context, `command` repeats this params file and these `section.key=value`s."""
     latest: dict[str, str] = {}
     for override in overrides:
         key = override.partition("=")[0]
-        latest.pop(key, None)  # what is set last stands last
+        latest.pop(key, None)  # the latest setting comes last
         latest[key] = override
     settings = [f"--set {shlex.quote(o)}" for key, o in latest.items() if key not in _NOT_REPEATED]
     file = [] if params == DEFAULT_PARAMS else [f"--params {shlex.quote(str(params))}"]
@@ -37,10 +37,10 @@ def running_with(params: Path, overrides: Sequence[str]) -> Generator[None]:
 
 
 def command(stage: str, *options: str) -> str:
-    """`python -m stages.<stage>` with its options, to be pasted into a shell.
+    """`python -m stages.<stage>` with its options, for a shell.
 
-    It repeats the params file and the settings of the running command, less those that `options`
-    set themselves (as `pipeline.base.config.setting` writes them).
+    It repeats the params file and the settings of the running command, except those that `options`
+    set (as `pipeline.base.config.setting` writes them).
     """
     own = {_key(option) for option in options}
     repeated = [option for option in _repeated if _key(option) not in own - {None}]

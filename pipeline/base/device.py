@@ -1,6 +1,7 @@
 """The device of tensors, and its precision.
 
-Importing torch takes over a second, which a command that has nothing to do must not spend.
+torch is imported inside the functions: it takes over a second, which a command that has nothing to
+do must not spend.
 """
 
 from typing import TYPE_CHECKING, Literal
@@ -13,7 +14,7 @@ if TYPE_CHECKING:
 
 
 def resolve_device(name: str) -> "torch.device":
-    """The device of a `device:` param; `auto` is the first CUDA device where there is one.
+    """The device of a `device:` param; `auto` is the first CUDA device, or the CPU without one.
 
     Raises `ConfigError` for a device that this machine or this build of torch does not have.
     """
@@ -38,8 +39,8 @@ def resolve_device(name: str) -> "torch.device":
 def use_bfloat16(amp: Literal["auto", "off", "bfloat16"], device: "torch.device") -> bool:
     """Whether the forward pass runs under bfloat16 autocast.
 
-    `auto` means yes on a CUDA device with bfloat16 arithmetic. Elsewhere autocast seldom pays, and
-    float32 keeps a run reproducible to the bit.
+    `auto` means yes on a CUDA device with bfloat16 arithmetic. Elsewhere autocast is rarely faster,
+    and float32 keeps a run reproducible to the bit.
     """
     import torch
 

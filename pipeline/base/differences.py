@@ -9,10 +9,10 @@ Differences = dict[str, tuple[Any, Any]]
 
 
 def differences(expected: Any, actual: Any, place: str = "") -> Differences:
-    """The places of two JSON documents that differ, in the order of the first.
+    """The places where two JSON documents differ, in the order of the first.
 
-    Two mappings with equal `digest` are equal. If their digests differ, the entries that differ are
-    named, and the digest only where all entries agree. Two lists of mappings of equal length are
+    Two mappings with equal `digest` are equal. If their digests differ, the result has the entries
+    that differ, and the digest only if all entries agree. Two lists of mappings of equal length are
     compared entry by entry, other lists as a whole.
     """
     if isinstance(expected, Mapping) and isinstance(actual, Mapping):
@@ -41,15 +41,15 @@ def differences(expected: Any, actual: Any, place: str = "") -> Differences:
 
 
 def describe(differing: Differences, arrow: str = " -> ") -> list[str]:
-    """A line for each place, `prompt: "x" -> "y"`; long values are cut around where they differ.
+    """A line for each place, `prompt: "x" -> "y"`; long values are cut around their difference.
 
-    Of two lists of mappings, which differ in length, a line says how many entries they have.
+    For two lists of mappings of different length, a line says how many entries they have.
     """
     return [f"{place}: {_short(a, b)}{arrow}{_short(b, a)}" for place, (a, b) in differing.items()]
 
 
 def _short(value: Any, other: Any, most: int = 80) -> str:
-    # Entries of lists of one length are compared: these lists differ in theirs.
+    # Lists of equal length are compared by entry, so these differ in length.
     if isinstance(value, list) and any(isinstance(entry, Mapping) for entry in value):
         return f"{len(value)} entries"
     text, beside = (json.dumps(side, ensure_ascii=False) for side in (value, other))

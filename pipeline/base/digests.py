@@ -1,7 +1,7 @@
 """Content digests of files, remembered by path, size and mtime.
 
-A file is read once; as long as its size and modification time (ns) stay, its digest is looked up.
-The ledger only saves reading: losing it costs time, never correctness.
+A file is read once; while its size and modification time (ns) stay the same, its digest is looked
+up. The ledger only saves reads: to lose it costs time, never correctness.
 """
 
 import hashlib
@@ -19,9 +19,9 @@ from pipeline.base.errors import ConfigError, DiskFull, PipelineError, Recording
 from pipeline.base.files import described
 
 LEDGER_SUFFIX = ".files.sqlite"
-"""How the name of a store's ledger of file digests ends."""
+"""The suffix of a store's ledger of file digests."""
 _APPLICATION = 0x564C4146
-"""SQLite's `application_id` of a ledger, in its header at bytes 68 to 71, big-endian."""
+"""SQLite's `application_id` of a ledger, in bytes 68 to 71 of its header, big-endian."""
 
 _TABLE = "known (key TEXT PRIMARY KEY, value BLOB)"
 _DAMAGED = {
@@ -30,15 +30,15 @@ _DAMAGED = {
     sqlite3.SQLITE_FORMAT,
     sqlite3.SQLITE_NOTADB,
 }
-"""SQLite's errors for a damaged ledger; for one in memory any error is taken as one."""
+"""SQLite's errors that mean a damaged ledger; for a ledger in memory, any error does."""
 _FILE = Border(RecordingError, "Copy the file again, or leave its recording out.")
 
 
 class ContentDigests:
-    """Digests of files, kept in one SQLite file, or where that is None only in memory.
+    """Digests of files, kept in one SQLite file, or only in memory where `ledger` is None.
 
     Raises `ConfigError` where something else lies there or it cannot be written. A damaged ledger
-    is begun anew, and what is damaged in it is not known.
+    is replaced by an empty one; a damaged entry counts as missing.
     """
 
     def __init__(self, ledger: Path | None, only_read: bool = False) -> None:
@@ -50,9 +50,9 @@ class ContentDigests:
 
     @classmethod
     def to_read(cls, ledger: Path) -> "ContentDigests":
-        """The ledger; where it cannot be written, what it knows, and nothing new is remembered.
+        """The ledger, or a copy of it in memory where the file cannot be written.
 
-        Removes nothing. Raises `ConfigError` where something else lies there.
+        It removes nothing. Raises `ConfigError` where something else lies there.
         """
         _refuse_foreign(ledger)
         try:
@@ -61,10 +61,10 @@ class ContentDigests:
             return opened
         except (OSError, PipelineError):
             known = cls(None)
-            # With no file made beside it, as sqlite else would.
+            # immutable: otherwise sqlite creates files beside it.
             place = f"file:{quote(str(ledger.absolute()))}?immutable=1"
             with (
-                suppress(sqlite3.DatabaseError),  # it only saves reading
+                suppress(sqlite3.DatabaseError),  # it only saves reads
                 closing(sqlite3.connect(place, uri=True)) as file,
             ):
                 file.backup(known._database)
@@ -86,7 +86,7 @@ class ContentDigests:
         self._database.close()
 
     def of(self, path: Path) -> str:
-        """The `file_digest` of a file, read where it is not known.
+        """The `file_digest` of a file; reads the file if it is not known.
 
         Raises `RecordingError` when the file cannot be read.
         """
@@ -100,24 +100,24 @@ class ContentDigests:
             return self._found("file", what, lambda: file_digest(path))
 
     def note_rate(self, what: str, rows_per_s: float) -> None:
-        """Remember how fast rows were computed, for the estimate of a later plan."""
+        """Remember how fast rows were computed, for later estimates."""
         self._note("rate", what, str(rows_per_s))
 
     def rate(self, what: str) -> float | None:
-        """Rows a second of the last session under that name."""
+        """Rows per second of the last session under that name; None if unknown."""
         known = self._known("rate", what)
         return None if known is None else float(known)
 
     def note_bad(self, episode: str, reason: str) -> None:
-        """Remember that the episode of this digest cannot be used."""
+        """Remember that the episode with this digest cannot be used."""
         self._note("bad", episode, reason)
 
     def bad(self, episode: str) -> str | None:
-        """Why the episode of this digest cannot be used; None where nothing is known."""
+        """Why the episode with this digest cannot be used; None where nothing is known."""
         return self._known("bad", episode)
 
     def text(self, what: str, make: Callable[[], str]) -> str:
-        """What `make` gives, made once: `what` names everything that it depends on."""
+        """The result of `make`, computed once; `what` must name all its inputs."""
         return self._found("text", what, make)
 
     def _found(self, kind: str, what: str, make: Callable[[], str]) -> str:
@@ -133,7 +133,7 @@ class ContentDigests:
         return value if checksum == joint_digest(key, value) else None
 
     def _note(self, kind: str, what: str, value: str) -> None:
-        """Remember a text by the digest of its name, with a checksum before it."""
+        """Remember a text under the digest of its name, with a checksum before it."""
         key = joint_digest(kind, what)
         text = (joint_digest(key, value) + value).encode("utf-8", "surrogateescape")
         self._rows[key] = text
@@ -141,12 +141,12 @@ class ContentDigests:
 
     @cached_property
     def _rows(self) -> dict[str, bytes]:
-        """All that is known, read at once: a query a file would take longer than its `stat`."""
+        """All entries, read at once, because a query per file would take longer than its `stat`."""
         return dict(self._ask("SELECT key, CAST(value AS BLOB) FROM known") or ())
 
     def _ask(self, statement: str, *values: object) -> list[Any] | None:
-        """The rows that a statement gives; None where the ledger is damaged: then another is begun
-        in its place, in memory where this one may only be read."""
+        """The result rows of a statement; None where the ledger is damaged, which is then replaced
+        by an empty one (in memory if this one may only be read)."""
         try:
             return self._database.execute(statement, values).fetchall()
         except (sqlite3.DatabaseError, UnicodeDecodeError) as error:
@@ -180,14 +180,15 @@ def _real(folder: str) -> str:
 
 
 def ledger_path(store: Path) -> Path:
-    """Where the digests of a store's recordings and checkpoint are remembered: beside it."""
+    """The ledger of a store's recordings and checkpoint, beside the store."""
     return store.with_name(f"{store.name}{LEDGER_SUFFIX}")
 
 
 def is_ledger(path: Path) -> bool:
-    """Whether content digests, a damaged file of them too, or nothing at all lies there.
+    """Whether a ledger, even a damaged one, or nothing lies at `path`.
 
-    Looks without SQLite's own files beside it. What cannot be read is left to who opens it.
+    It does not look at SQLite's own files beside it. An unreadable file counts; opening it raises
+    the error.
     """
     if not path.is_file():
         return not path.exists()
@@ -211,9 +212,9 @@ def _refuse_foreign(ledger: Path) -> None:
 
 
 def file_digest(path: Path) -> str:
-    """The digest of a file's content, read anew: 32 hex digits of BLAKE2b.
+    """The digest of a file's content, always read: 32 hex digits of BLAKE2b.
 
-    Raises `RecordingError` for what is no regular file.
+    Raises `RecordingError` unless it is a regular file.
     """
     _FILE.check_file(path)
     with path.open("rb") as file:
@@ -221,7 +222,7 @@ def file_digest(path: Path) -> str:
 
 
 def joint_digest(*parts: str) -> str:
-    """The digest of several texts in this order, each told from its neighbours: 32 hex digits."""
+    """The digest of several texts in order, with clear boundaries between them: 32 hex digits."""
     hasher = hashlib.blake2b(digest_size=16)
     for part in parts:
         hasher.update(f"{len(part)}:".encode() + part.encode("utf-8", "surrogateescape"))

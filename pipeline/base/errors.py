@@ -1,13 +1,13 @@
-"""The errors that a user can mend.
+"""The errors that a user can fix.
 
-A stage prints a `PipelineError` without a traceback and exits with 2. The message says the
-expected and the actual value, the place, and what to run next. Each child is also the builtin
-error that a caller would catch without knowing this package.
+A stage prints a `PipelineError` without a traceback and exits with 2. The message says the expected
+and the actual value, the place, and what to run next. Each subclass is also the builtin error that
+a caller would catch without knowing this package.
 """
 
 
 class PipelineError(Exception):
-    """Base of all errors that the user can mend."""
+    """Base of all errors that the user can fix."""
 
 
 class ConfigError(PipelineError, ValueError):
@@ -43,11 +43,11 @@ class DiskFull(PipelineError, OSError):
 
 
 class TooManyMaps(PipelineError, OSError):
-    """The kernel maps no more files into this process."""
+    """The kernel refuses to map more files into this process."""
 
 
 class NumericsError(PipelineError, ArithmeticError):
-    """A NaN or an infinity where a number must be."""
+    """A NaN or an infinity where a finite number is needed."""
 
 
 class CheckpointMismatch(PipelineError, ValueError):

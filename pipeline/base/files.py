@@ -1,9 +1,9 @@
-"""Files and folders that survive a kill, and the marker that says which of them this project wrote.
+"""Files and folders that survive a kill, and the marker of those that this project wrote.
 
-A file or folder is written beside its place, synced and renamed into it. Only what this project
-wrote is ever replaced or removed: a complete store or training says by itself what it is, every
-other folder holds `MARKER`, which is the first thing written into it and the last removed. An empty
-folder is anybody's.
+A file or folder is written beside its place, synced and renamed. This project replaces and removes
+only what it wrote. A complete store or training is known by its content; every other folder has
+`MARKER`, which is the first file written into it and the last one removed. An empty folder may
+always be used.
 """
 
 import errno
@@ -31,42 +31,42 @@ T = TypeVar("T")
 MARKER = ".vla-feature-cache"
 FULL = (errno.ENOSPC, errno.EDQUOT)
 DIGEST = "document_sha256"
-"""The key of a document's entry that holds the digest of all other entries."""
+"""The key in a document for the digest of all other entries."""
 RUN_FILES = Border(
     CheckpointIncomplete,
     "Copy it again, name another, or remove its folder and run the training that writes it "
     "(stages.train_head or stages.finetune) again.",
 )
-"""How a damaged file of a training is refused."""
+"""Refuses a damaged file of a training."""
 _DOCUMENT = dict[str, JsonValue]
 _MOST_BYTES = 64 * 2**20
-"""Of a document: the normalisation of a wide policy's features takes 20 MB."""
+"""Most bytes of a document; the normalisation of a wide policy's features takes 20 MB."""
 _MOST_WEIGHT = 2 * MOST_WEIGHT
-"""Of a document with its digest: 80,000 episodes weigh 4 million, a million steps' rows 5."""
+"""Most weight of a document with a digest; a million steps' rows weigh 5 million."""
 
 
 @dataclass(frozen=True)
 class OutputKind:
-    """A kind of output, by the line in its marker."""
+    """A kind of output; `name` is the line in its marker."""
 
     name: str
-    """With its article, as an error calls it."""
+    """With its article, as it appears in errors."""
     is_one: Callable[[Path], bool] = lambda path: False
-    """Tells a complete one, which holds no marker."""
+    """Recognises a complete one that has no marker."""
     advice: str = ""
-    """What an error adds where something else lies there."""
+    """What an error adds if something else lies in the place."""
 
     def owns(self, path: Path) -> bool:
-        """Whether this project may replace what lies there as one of this kind."""
+        """Whether this project may replace what lies at `path` as one of this kind."""
         return self.is_one(path) or (path.is_dir() and (self.marks(path) or _is_empty(path)))
 
     def marks(self, path: Path) -> bool:
-        """Whether it is marked as one of this kind."""
+        """Whether `path` has the marker of this kind."""
         return _marked(path) == self.name
 
 
 def begins_with(line: str) -> Callable[[Path], bool]:
-    """Tells a file by the beginning of its first line; an empty file is anybody's."""
+    """Recognises a file by the start of its first line; an empty file always counts."""
 
     def begins(path: Path) -> bool:
         if not path.is_file():
@@ -78,12 +78,12 @@ def begins_with(line: str) -> Callable[[Path], bool]:
 
 
 def there(path: Path) -> bool:
-    """Whether anything has this name, a link to nothing too."""
+    """Whether anything has this name, even a dangling link."""
     return path.exists() or path.is_symlink()
 
 
 def described(path: Path) -> str:
-    """What lies there, for an error."""
+    """What lies at `path`, for an error."""
     if not path.is_dir():
         return "a file" if path.exists() else "a link to nothing"
     names = sorted(entry.name for entry in path.iterdir())
@@ -103,23 +103,23 @@ def refuse_foreign(path: Path, kind: OutputKind) -> None:
 
 
 def remove_folder(path: Path, kind: OutputKind) -> None:
-    """Remove a folder of this kind, if there is one; of one behind a symbolic link, the link alone.
+    """Remove a folder of this kind, if there is one; if it is a symbolic link, only the link.
 
-    Files go before folders, so that what a kill leaves looks like nothing complete, and the marker
-    goes last. Raises `ConfigError` where it is not this project's.
+    Files are removed before folders, so that after a kill the rest does not look complete, and the
+    marker is removed last. Raises `ConfigError` where it is not this project's.
     """
     refuse_foreign(path, kind)
     if path.is_symlink():
         path.unlink()
     elif path.exists():
-        with suppress(OSError):  # on a full disk, where only a kill from here on would show
+        with suppress(OSError):  # a full disk, where the marker matters only after a kill
             mark(path, kind)
         _empty(path, MARKER)
         shutil.rmtree(path)
 
 
 def begin_folder(path: Path, kind: OutputKind, but: str = MARKER) -> None:
-    """Make an empty, marked folder, in place of one of this kind; its entry `but` stays."""
+    """Make an empty, marked folder, or empty one of this kind; its entry `but` stays."""
     if path.is_symlink():
         remove_folder(path, kind)
     claim(path, kind)
@@ -136,7 +136,7 @@ def _empty(folder: Path, *but: str) -> None:
 
 
 def claim(folder: Path, kind: OutputKind) -> None:
-    """Make a folder, or take one of this kind as it is, and mark it.
+    """Make a folder, or keep one of this kind, and mark it.
 
     Raises `ConfigError` where it is not this project's.
     """
@@ -146,22 +146,22 @@ def claim(folder: Path, kind: OutputKind) -> None:
 
 
 def mark(folder: Path, kind: OutputKind) -> None:
-    """Write down that a folder is of this kind, unless it says so already."""
+    """Write the marker of this kind into a folder, unless it is there."""
     if _marked(folder) != kind.name:
-        unmark(folder)  # DVC may have linked it into its cache
+        unmark(folder)  # it may be a link into DVC's cache
         (folder / MARKER).write_text(f"{kind.name}\n", encoding="utf-8")
 
 
 def unmark(folder: Path) -> None:
-    """Take the marker away from a folder that says by itself what it is."""
+    """Remove the marker from a folder that is known by its content."""
     (folder / MARKER).unlink(missing_ok=True)
 
 
 def replace_folder(folder: Path, write: Callable[[Path], None], kind: OutputKind) -> None:
-    """Put what `write` writes into a temporary folder at `folder`, in place of what is there.
+    """Replace `folder` by a temporary folder into which `write` has written.
 
-    A kill leaves the old content or the new, as `put_in_place` does. Raises `DiskFull` with the old
-    in place, and `ConfigError` where something that is not of this kind lies there.
+    A kill leaves the old or the new content, as in `put_in_place`. Raises `DiskFull` and keeps the
+    old content, and `ConfigError` where something that is not of this kind lies there.
     """
     recover_folder(folder, kind)
     temporary = _beside(folder, "new")
@@ -186,10 +186,10 @@ def recover_folder(folder: Path, kind: OutputKind) -> None:
 
 
 def put_in_place(complete: Path, target: Path, kind: OutputKind) -> None:
-    """Rename a complete folder to `target` and remove what was there; of a link, the link alone.
+    """Rename a complete folder to `target` and remove what was there; if a link, only the link.
 
-    A kill leaves the old one or the new: the old one moves into the complete folder, from where
-    `recover` brings it back. Raises `ConfigError` where the old one is not of this kind.
+    A kill leaves the old or the new one: the old one first moves into the complete folder, and
+    `recover` brings it back from there. Raises `ConfigError` where the old one is not of this kind.
     """
     refuse_foreign(target, kind)
     unmark(complete)
@@ -203,7 +203,7 @@ def put_in_place(complete: Path, target: Path, kind: OutputKind) -> None:
 def recover(complete: Path, target: Path, kind: OutputKind) -> None:
     """Undo or complete a `put_in_place` that a kill stopped.
 
-    Raises `ConfigError` where what lies at `target` is not of this kind.
+    Raises `ConfigError` where something at `target` is not of this kind.
     """
     refuse_foreign(target, kind)
     if there(complete / REPLACED) and not there(target):
@@ -212,7 +212,7 @@ def recover(complete: Path, target: Path, kind: OutputKind) -> None:
         if there(earlier / target.name) and not there(target):
             (earlier / target.name).rename(target)
         remove_folder(earlier, HELD)
-    # In the complete folder it still lies where the user has put another one back.
+    # It is still in the complete folder if the user has restored another `target`.
     for replaced in (complete / REPLACED, target / REPLACED):
         if replaced.is_symlink():
             replaced.unlink()
@@ -223,20 +223,20 @@ REPORT = OutputKind(
     "a folder of reports",
     advice=f" (Reports of earlier versions hold no {MARKER}: move or remove these.)",
 )
-"""What evaluations, inspections, probes, comparisons and trainings show; it keeps its marker."""
+"""The reports of evaluations, inspections, probes, comparisons and trainings; keeps its marker."""
 HELD = OutputKind("a folder that is being replaced,")
-"""What earlier versions put the old folder into, as `<name>.replaced`."""
+"""The folder `<name>.replaced`, into which earlier versions moved the old folder."""
 REPLACED = ".replaced"
-"""Where the old folder lies in the new one until it is removed."""
+"""The place of the old folder in the new one until its removal."""
 
 
 def _is_empty(folder: Path) -> bool:
-    """Whether nothing is in it, or a marker alone that a kill cut off before its line."""
+    """Whether a folder has nothing in it, or only an empty marker that a kill left."""
     return all(entry.name == MARKER and not entry.stat().st_size for entry in folder.iterdir())
 
 
 def _marked(folder: Path) -> str | None:
-    """The kind that a folder is marked with."""
+    """The name in a folder's marker; None without a marker."""
     try:
         return (folder / MARKER).read_text(encoding="utf-8", errors="replace").strip()
     except (FileNotFoundError, NotADirectoryError):
@@ -245,13 +245,13 @@ def _marked(folder: Path) -> str | None:
 
 @contextmanager
 def disk_full_named(place: Path) -> Generator[None]:
-    """Turn "no space left" and "quota exceeded" into `DiskFull` naming the place."""
+    """Turn "no space left" and "quota exceeded" into a `DiskFull` that names the place."""
     try:
         yield
     except DiskFull:
         raise
     except (OSError, SafetensorError) as error:
-        # safetensors says the number in words only.
+        # safetensors gives the error number only in its text.
         in_words = any(f"(os error {number})" in str(error) for number in FULL)
         if not in_words and getattr(error, "errno", None) not in FULL:
             raise
@@ -269,17 +269,17 @@ def free_bytes(path: Path) -> int:
 
 
 def fresh(path: Path) -> Path:
-    """The path, with nothing at it.
+    """The path, after removing a file there.
 
-    DVC restores files as hard links into its cache, so that writing into one would alter the
-    cache; a new file of the same name leaves it alone.
+    DVC restores files as hard links into its cache, so a write into one would change the cache; a
+    new file of the same name does not.
     """
     path.unlink(missing_ok=True)
     return path
 
 
 def sync(path: Path) -> None:
-    """Wait until a file's content, or a folder's list of names, is on the disk."""
+    """Wait until a file's content, or a folder's list of entries, is on the disk."""
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)
@@ -288,7 +288,7 @@ def sync(path: Path) -> None:
 
 
 def write_document(path: Path, document: Mapping[str, Any]) -> None:
-    """Write a JSON document, atomically; its floats come back to the bit. Raises `DiskFull`."""
+    """Write a JSON document atomically; its floats are read back bit for bit. Raises `DiskFull`."""
     temporary = _beside(path, "new")
     text = json.dumps(document, indent=1, ensure_ascii=False, allow_nan=False)
     with disk_full_named(path):
@@ -298,15 +298,16 @@ def write_document(path: Path, document: Mapping[str, Any]) -> None:
 
 
 def write_with_digest(path: Path, document: Mapping[str, Any]) -> None:
-    """As `write_document`, with a digest of the document in it, which reading checks."""
-    read = json.loads(json.dumps(document, allow_nan=False))  # where all keys are strings
+    """Like `write_document`, with a digest of the document, which `read_document` checks."""
+    read = json.loads(json.dumps(document, allow_nan=False))  # so that all keys are strings
     write_document(path, {**document, DIGEST: _document_sha256(read)})
 
 
 def read_document(path: Path, model: type[T]) -> tuple[T, dict[str, Any]]:
     """The JSON document at `path` as the model, and as a dictionary without its digest.
 
-    Raises `CheckpointIncomplete` where it is missing, is none, or is not what its digest is of.
+    Raises `CheckpointIncomplete` where it is missing, not a JSON document, or does not give its
+    digest.
     """
     text = RUN_FILES.read_bytes(path, _MOST_BYTES)
     document = RUN_FILES.parse_json(text, _DOCUMENT, path, _MOST_WEIGHT)
@@ -329,16 +330,16 @@ def _document_sha256(document: Mapping[str, Any]) -> str:
 
 def write_tensors(path: Path, tensors: Mapping[str, "Tensor"]) -> str:
     """Write tensors as safetensors and return the sha256 of the file."""
-    from safetensors.torch import save_file  # torch: most that write files here hold no tensor
+    from safetensors.torch import save_file  # torch: most callers here have no tensor
 
     save_file({name: value.detach().cpu().contiguous() for name, value in tensors.items()}, path)
-    # safetensors writes for the owner alone; other files have what the umask leaves.
+    # safetensors writes only for the owner; give the file the folder's mode.
     path.chmod(path.parent.stat().st_mode & 0o666)
     return sha256_of(path)
 
 
 def read_tensors(path: Path, sha256: str) -> "dict[str, Tensor]":
-    """The tensors at `path`; `CheckpointIncomplete` when they are not those that were written."""
+    """The tensors at `path`; `CheckpointIncomplete` if the file was changed or damaged."""
     from safetensors.torch import load_file
 
     check_digest(path, sha256)
@@ -347,10 +348,10 @@ def read_tensors(path: Path, sha256: str) -> "dict[str, Tensor]":
 
 
 def check_digest(path: Path, sha256: str) -> None:
-    """Raise `CheckpointIncomplete` where the file at `path` is not the one that was written."""
+    """Raise `CheckpointIncomplete` unless the safetensors file at `path` has this sha256."""
     RUN_FILES.check_file(path)
     with RUN_FILES.foreign(path, "cut off or damaged"), safe_open(path, "numpy"):
-        pass  # the head says how long the file is: none is read without an end
+        pass  # the header gives the file's length: refuses a truncated one before reading all
     if sha256_of(path) != sha256:
         raise RUN_FILES.refusal(path, "its sha256 is not the one written with it")
 

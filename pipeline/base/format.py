@@ -1,4 +1,4 @@
-"""Bytes, seconds and documents, as people read them."""
+"""Bytes, seconds and documents in readable form."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -7,7 +7,7 @@ from typing import Any
 import yaml
 
 MOST_LINES = 20
-"""Lines of one kind that are shown; the rest is counted."""
+"""Most lines of one kind that are shown; the rest is only counted."""
 
 
 def size(count: float) -> str:
@@ -27,7 +27,7 @@ def duration(seconds: float) -> str:
 
 
 def capped(lines: Sequence[str], kind: str, most: int = MOST_LINES) -> list[str]:
-    """The first lines, and a line with the number of the others."""
+    """The first lines, and one line with the number of the others if there are any."""
     more = len(lines) - most
     return [*lines[:most], *([f"and {more} more {kind}"] if more > 0 else [])]
 

@@ -1,6 +1,6 @@
 """Golden rows: a few rows whose decoded frames are kept beside their features.
 
-So the features can be computed again, on another machine and without a recording.
+With them the features can be computed again, on another machine and without a recording.
 """
 
 import hashlib
@@ -11,15 +11,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 MOST_GOLDEN = 4
-"""Golden rows of a store, at most."""
+"""Most golden rows in a store."""
 
 Frames = Mapping[str, NDArray[np.uint8]]
-"""By view: (height, width, 3) RGB as decoded, before any resize; a missing view is left out."""
+"""View -> (height, width, 3) RGB as decoded, before any resize; without missing views."""
 
 
 @dataclass(frozen=True, eq=False)
 class GoldenRow:
-    """A VL row with all inputs of its features, and the features as they are stored."""
+    """A VL row with all inputs of its features, and the stored features."""
 
     key: bytes
     """`row_key` of its feature spec, prompt and frames."""
@@ -28,7 +28,7 @@ class GoldenRow:
     """The rendered prompt."""
     frames: Frames
     features: NDArray[np.float32]
-    """(slot, dim) of the plain frames."""
+    """(slot, dim), of the plain frames."""
     slot_valid: NDArray[np.bool_]
     """(slot,)"""
 
@@ -47,9 +47,9 @@ def row_key(spec_digest: str, views: Sequence[str], prompt: str, frames: Frames)
 
 
 def spread(rows: NDArray[np.int64], views: NDArray[np.int64]) -> NDArray[np.int64]:
-    """At most `MOST_GOLDEN` of these rows, evenly spread over those that have the most views.
+    """At most `MOST_GOLDEN` of these rows, evenly spread over those with the most views.
 
-    `views` (row,) is the number of views of each.
+    `views` (row,) is the number of views of each row.
     """
     full = rows[views == views.max(initial=0)]
     places = np.linspace(0, max(0, len(full) - 1), min(MOST_GOLDEN, len(full)))
@@ -57,6 +57,6 @@ def spread(rows: NDArray[np.int64], views: NDArray[np.int64]) -> NDArray[np.int6
 
 
 def _add(digest: "hashlib.blake2b", part: bytes) -> None:
-    # The length comes first: a character that moves to the next part gives another key.
+    # The length comes first, so that a character moved to the next part changes the key.
     digest.update(len(part).to_bytes(8, "little"))
     digest.update(part)

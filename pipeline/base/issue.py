@@ -10,22 +10,22 @@ Severity = Literal["error", "warning", "note", "ok"]
 
 @dataclass(frozen=True, kw_only=True)
 class Issue:
-    """One checked thing and its state; times are float64 seconds on its own clock."""
+    """One checked thing and its state; times are float64 seconds on the episode's own clock."""
 
     severity: Severity
     kind: str
-    """As docs/looking.md explains it: `gap`, `dead camera`, …"""
+    """As explained in docs/looking.md: `gap`, `dead camera`, …"""
     message: str
     """One line with the expected and the actual value."""
     source: str = ""
     episode: str = ""
     stream: str = ""
-    """`view View1`, `sensor`, `state`, …, or an array of a store; empty for all of it."""
+    """`view View1`, `sensor`, `state`, …, or an array of a store; empty where it concerns all."""
     start_s: float | None = None
-    """None where it is all of the stream."""
+    """None where it concerns the whole stream."""
     stop_s: float | None = None
     file: Path | None = None
     chunk: int | None = None
-    """Of the array, where only one chunk file has it."""
+    """The chunk of the array, if it concerns only one chunk file."""
     remedy: str = ""
     """What to install, set or run."""

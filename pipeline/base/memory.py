@@ -1,6 +1,6 @@
-"""The memory of this process: the machine's, or the limit of its container or job.
+"""The memory for this process: the machine's, or the limit of its container or job.
 
-Limits are those of the control groups (version 2) that the process is in, and of their parents.
+Limits are those of the process's control groups (version 2) and their parents.
 """
 
 from collections.abc import Iterator
@@ -10,16 +10,16 @@ _ROOT = Path("/")
 
 
 _FILE_PAGES = ("inactive_file", "active_file")
-"""Lines of memory.stat: pages of files, which count as used and can be dropped."""
+"""Lines of memory.stat for pages of files, which count as used but can be dropped."""
 
 
 def memory_bytes(root: Path = _ROOT) -> int:
-    """Memory that this process may use; `root` holds proc and sys."""
+    """Bytes of memory that this process may use; `root` holds proc and sys."""
     return min([_meminfo(root)["MemTotal"], *(limit for limit, _ in _limits(root))])
 
 
 def available_bytes(root: Path = _ROOT) -> int:
-    """Free memory without swapping; file pages that can be dropped count as free.
+    """Bytes free without swapping; file pages that can be dropped count as free.
 
     `root` holds proc and sys.
     """
@@ -28,10 +28,10 @@ def available_bytes(root: Path = _ROOT) -> int:
 
 
 def _limits(root: Path) -> Iterator[tuple[int, int]]:
-    """Limit and use, in bytes, of each limited control group from the process's own upwards."""
+    """Limit and use, in bytes, of each limited control group, from the process's own upwards."""
     top = root / "sys/fs/cgroup"
     own = top / _read(root / "proc/self/cgroup").rpartition("::/")[2]
-    # In a container the path may be the host's: then only the first group is visible.
+    # In a container the path may be the host's; then only the top group exists.
     for group in (own, *own.parents):
         limit, used = _read(group / "memory.max"), _read(group / "memory.current")
         if limit.isdigit() and used.isdigit():
@@ -42,17 +42,17 @@ def _limits(root: Path) -> Iterator[tuple[int, int]]:
 
 
 def _meminfo(root: Path) -> dict[str, int]:
-    """In bytes; `MemAvailable` is there since Linux 3.14."""
+    """Values in bytes; `MemAvailable` exists since Linux 3.14."""
     kilobytes = _numbers(_read(root / "proc/meminfo").replace(":", ""))
     return {name: number * 1024 for name, number in kilobytes.items()}
 
 
 def _numbers(text: str) -> dict[str, int]:
-    """`name number …` a line."""
+    """The numbers of lines such as `name number …`."""
     lines = (line.split() for line in text.splitlines())
     return {words[0]: int(words[1]) for words in lines if len(words) > 1 and words[1].isdigit()}
 
 
 def _read(path: Path) -> str:
-    """The text of a file, empty where there is none."""
+    """The text of a file; empty where there is no file."""
     return path.read_text(encoding="ascii").strip() if path.is_file() else ""

@@ -1,4 +1,4 @@
-"""The input of a policy, which stores gather and robots measure."""
+"""The input of a policy, gathered from a store or measured by a robot."""
 
 from dataclasses import dataclass
 
@@ -10,9 +10,9 @@ from torch import Tensor
 class Observation:
     """The input of a policy at `batch` ticks, in physical units.
 
-    Streams come in their stored dtype, right-aligned: windows end at their tick and are zero on the
-    left where the episode had not begun; `*_valid` counts the real readings. A stream that is
-    absent has width 0.
+    Streams have their stored dtype. Windows are right-aligned: they end at their tick and are zero
+    on the left where the episode had not begun; `*_valid` counts the real readings. An absent
+    stream has width 0.
     """
 
     features: Float[Tensor, "batch slot dim"]
@@ -20,12 +20,12 @@ class Observation:
     feature_age: Float[Tensor, " batch"]
     """Seconds since the newest frame of the features."""
     view_age: Float[Tensor, "batch view"]
-    """Seconds since the features' frame of each view; NaN of a missing view."""
+    """Seconds since each view's frame in the features; NaN for a missing view."""
     sensor: Float[Tensor, "batch sensor_window channel"]
     sensor_valid: Int[Tensor, " batch"]
     sensor_age: Float[Tensor, "batch sensor_window"]
-    """Seconds since each reading, 0 where it is not real."""
+    """Seconds since each reading; 0 where it is not real."""
     state: Float[Tensor, "batch state_window state_dim"]
     state_valid: Int[Tensor, " batch"]
     state_age: Float[Tensor, "batch state_window"]
-    """As `sensor_age`."""
+    """Like `sensor_age`."""

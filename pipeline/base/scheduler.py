@@ -1,6 +1,6 @@
-"""dask schedulers: a private one for a single command, or the one at a user's address.
+"""dask schedulers: a private one for a single command, or one at a user's address.
 
-Whoever reaches a dask scheduler can run any code on its workers, as the user who started them.
+Anyone who can reach a dask scheduler can run any code on its workers, as the user who started them.
 """
 
 import logging
@@ -15,17 +15,17 @@ from distributed.security import Security
 from pipeline.base.errors import ConfigError
 
 TIMEOUT_S = 10
-"""For reaching a scheduler, and for reaching it again when the connection is lost."""
+"""Time to reach a scheduler, and to reach it again after a lost connection."""
 
 
 def private_cluster(
     workers: int, threads: int, allowed_failures: int = 3, env: Mapping[str, str] | None = None
 ) -> LocalCluster:
-    """Worker processes of this machine that only this process can talk to.
+    """Worker processes on this machine that only this process can talk to.
 
-    Every user of a machine reaches the ports of its loopback, so both ends of each connection show
-    a certificate that is made here and never leaves these processes; no web page is served. No
-    worker is restarted for its memory (a model may take most of it).
+    Every user of a machine can reach its loopback ports, so both ends of each connection need a
+    certificate that is made here and never leaves these processes; there is no dashboard. No worker
+    is restarted for its memory use, because a model may need most of the memory.
     """
     no_pages = {f"distributed.{who}.http.routes": [] for who in ("scheduler", "worker")}
     with dask.config.set(no_pages):
@@ -43,13 +43,13 @@ def private_cluster(
 
 
 def client_of(address: str, setting: str) -> Client:
-    """A client of the scheduler at `address`, which `setting` of params.yaml names.
+    """A client of the scheduler at `address`, the value of `setting` in params.yaml.
 
-    Raises `ConfigError` where none answers.
+    Raises `ConfigError` where no scheduler answers.
     """
     try:
         return Client(address, timeout=TIMEOUT_S, set_as_default=False)
-    # Without certificates tls:// is a TypeError; where dask's config demands them, tcp:// is a
+    # tls:// without certificates is a TypeError; tcp:// where dask's config demands them is a
     # RuntimeError.
     except (OSError, ValueError, TypeError, RuntimeError) as error:
         raise ConfigError(
@@ -61,9 +61,9 @@ def client_of(address: str, setting: str) -> Client:
 
 @contextmanager
 def quiet() -> Generator[None]:
-    """Keep dask's log off stderr: its errors are raised, or printed by us.
+    """Keep dask's log off stderr, because its errors are raised or printed here.
 
-    asyncio's log too: dask reports there that a process failed to start.
+    asyncio's log too, in which dask reports that a process failed to start.
     """
     loggers: list[Any] = [logging.getLogger(name) for name in ("distributed", "tornado", "asyncio")]
     levels = [logger.level for logger in loggers]

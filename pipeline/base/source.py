@@ -9,9 +9,9 @@ from pipeline.base.border import Document, Text
 
 
 def is_view_name(name: str) -> bool:
-    """Whether it can name a folder beside zarr's own files, without leading into another.
+    """Whether it can be the name of a folder beside zarr's own files, not a path into another.
 
-    zarr takes a backslash for a slash.
+    zarr reads a backslash as a slash.
     """
     whole = re.fullmatch(r"(?!\.|zarr\.json$)[^/\\\x00]+", name)
     return whole is not None and len(name.encode()) <= 200
@@ -41,7 +41,7 @@ class SlotDocument(Document):
 
 
 class Spec(Document):
-    """The entries of a feature spec that are used for more than comparison."""
+    """The entries of a feature spec that code uses, besides comparing them."""
 
     digest: Text
     views: list[ViewName]
@@ -70,9 +70,9 @@ class ActionChannels(Channels):
 
 
 CLOCK_SLACK_S = 1e-6
-"""A reading that is older than a window by less still counts as in it: clocks are rounded."""
+"""Clocks are rounded, so a reading older than a window by less than this counts as in it."""
 RATE_TOLERANCE = 0.1
-"""Rates count as equal if they differ by no more than this share."""
+"""Rates count as equal if they differ by at most this share."""
 
 
 class Streams(Document):
@@ -85,7 +85,7 @@ class Streams(Document):
 
 
 class SourceDocument(Document):
-    """The entries that a policy keeps of its store."""
+    """The entries of its store that a policy keeps."""
 
     feature_spec: Spec
     streams: Streams

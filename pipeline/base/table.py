@@ -1,4 +1,4 @@
-"""Tables, as text, CSV, Markdown and in a page."""
+"""Tables as text, CSV, Markdown and in a page."""
 
 import csv
 import io
@@ -14,14 +14,14 @@ from pipeline.base.files import disk_full_named, fresh
 NOTHING = "–"
 """Stands for a missing value."""
 DIGITS = 4
-"""Significant digits of a number that is no count."""
+"""Significant digits of a number that is not a count."""
 PLAIN = (1e-4, 1e7)
 """Magnitudes outside these are written with an exponent."""
 
 
 @dataclass(frozen=True)
 class Column:
-    """A column as words; `numeric` ones stand right."""
+    """A column as text; `numeric` ones are right-aligned."""
 
     head: str
     numeric: bool
@@ -30,7 +30,7 @@ class Column:
 
 @dataclass(frozen=True)
 class Table:
-    """Rows of cells under column heads; numbers stand right, in four significant digits.
+    """Rows of cells under column heads; numbers are right-aligned, with four significant digits.
 
     A cell is a word, a number, a bool or None.
     """
@@ -43,12 +43,12 @@ class Table:
 
     @classmethod
     def of(cls, rows: Iterable[Mapping[str, Any]]) -> "Table":
-        """The table of one row or more, each with the same heads."""
+        """The table of one or more rows with the same heads."""
         rows = list(rows)
         return cls(list(rows[0]), [list(row.values()) for row in rows])
 
     def words(self) -> list[Column]:
-        """The columns as words."""
+        """The columns as text."""
         return [
             _column(head, [row[index] for row in self.rows])
             for index, head in enumerate(self.columns)
@@ -73,7 +73,7 @@ class Table:
         return ["| " + " | ".join(line) + " |" for line in zip(*columns, strict=True)]
 
     def csv(self) -> str:
-        """For programs: floats in 6 significant digits, empty where there is no value."""
+        """For programs: floats with 6 significant digits; empty where there is no value."""
         text = io.StringIO()
         writer = csv.writer(text, lineterminator="\n")
         writer.writerow(self.columns)
@@ -91,7 +91,7 @@ class Table:
 
 
 def number(value: float) -> str:
-    """A number in four significant digits, thousands apart; NaN is an en dash."""
+    """A number with four significant digits and thousands separators; NaN is an en dash."""
     value = float(value)
     if math.isnan(value):
         return NOTHING
@@ -102,7 +102,7 @@ def number(value: float) -> str:
         return "0"
     if not PLAIN[0] <= size < PLAIN[1]:
         return f"{value:.{DIGITS - 1}e}"
-    # Of the rounded number: 9.9999 has one digit more before the point than it seems.
+    # Taken from the rounded number, because 9.9999 becomes 10.00.
     magnitude = int(f"{size:.{DIGITS - 1}e}".partition("e")[2])
     return f"{value:,.{max(0, DIGITS - 1 - magnitude)}f}"
 

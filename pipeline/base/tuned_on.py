@@ -11,7 +11,7 @@ from pipeline.base.errors import StoreIncomplete
 from pipeline.base.files import read_document, write_with_digest
 
 TUNED_ON = "tuned_on.json"
-"""The file in the folder of an adapter or of a tuned checkpoint; no part of its digest."""
+"""The file in the folder of an adapter or a tuned checkpoint; not part of its digest."""
 _ATTRIBUTE = "tuned_on"
 """The attribute of a store whose model has such a file."""
 _STORE = Border(StoreIncomplete, "Copy the store again, or extract it anew with stages.extract.")
@@ -25,11 +25,11 @@ class EpisodePart(Document):
     """The ticks of one episode on one side of a split."""
 
     ticks: Annotated[tuple[Tick, Tick], Strict(False)]
-    """[first, stop), counted in the episode."""
+    """[first, stop), counted from the episode's first tick."""
     content: Text
     """Digest of the episode's files."""
     group: Text
-    """Episodes of one group are on one side; a single episode may be cut by time."""
+    """Episodes of one group are on one side; a single episode may be split by time."""
 
     @model_validator(mode="after")
     def _has_ticks(self) -> Self:
@@ -42,7 +42,7 @@ class TunedPart(EpisodePart):
     """The ticks of one episode that a model has seen."""
 
     episode: Text
-    """As "source/id"."""
+    """"source/id"."""
 
 
 class TunedOn(Document):
@@ -97,5 +97,5 @@ def store_attributes(tuned: TunedOn | None) -> dict[str, Any]:
 
 
 def write_tuned_on(folder: Path, tuned: TunedOn) -> None:
-    """Write it beside the weights. Raises `DiskFull`."""
+    """Write `tuned` beside the weights. Raises `DiskFull`."""
     write_with_digest(folder / TUNED_ON, tuned.model_dump(mode="json"))

@@ -55,7 +55,7 @@ class Opened:
 
     recordings: tuple[Recording, ...]
     missing: tuple[str, ...]
-    """A line for each episode that a LeRobot `meta/` lists and whose files are not there."""
+    """One line for each episode that a LeRobot `meta/` lists but whose files are missing."""
     bad: tuple[BadEpisode, ...]
 
 
@@ -65,9 +65,9 @@ def open_recordings(
     """Every episode of the sources, without reading a stream or a frame.
 
     A relative path of a source resolves under `root`, by default the working directory. Only the
-    views in `views` are kept. Raises `RecordingError` where a path matches nothing, holds no
-    episode or not those of the source's `format`, where a LeRobot `meta/` is broken, and where no
-    recording has a wanted view.
+    views in `views` are kept. Raises `RecordingError` where a path matches nothing, has no episode
+    or episodes of another format than the source's `format`, where a LeRobot `meta/` is broken, and
+    where no recording has a wanted view.
     """
     recordings: list[Recording] = []
     missing: list[str] = []
@@ -100,15 +100,15 @@ def open_recordings(
 def open_recording(
     path: Path, format: str, id: str, views: Sequence[str] | None = None
 ) -> Recording:
-    """The one episode that a store names so; only the views in `views` are kept.
+    """The one episode that a store lists with this path, format and id; keeps the views in `views`.
 
-    Raises `RecordingError` where it is not there, or not of that format any more.
+    Raises `RecordingError` where it is missing or no longer of that format.
     """
     reader, source = READERS[format], Source(name=format, path=str(path))
     if not reader.marks(path, listing(path)):
         raise RecordingError(f"{path}: not of the format {format} (no {reader.marker})")
     episodes, _ = reader.open(path, source, views)
-    # Parent folders stand before an id that occurred more than once in its source.
+    # An id that occurs more than once in its source has parent folders before it.
     name = id.rpartition("/")[2]
     for episode in episodes:
         if format != "lerobot" or episode.id == name:
@@ -138,7 +138,7 @@ def _name_apart(recordings: Sequence[Recording]) -> None:
 def _check_views(recordings: Sequence[Recording], views: Sequence[str]) -> None:
     """Raise `RecordingError` where no recording has a wanted view.
 
-    Recordings are asked until all views were seen, pickles last.
+    It reads recordings until all views were seen, pickles last.
     """
     there: set[str] = set()
     for recording in sorted(recordings, key=lambda r: r.format == "old"):

@@ -1,4 +1,4 @@
-"""Numeric files -> arrays, with errors that name the file and the place in it."""
+"""Numeric files -> arrays; errors name the file and the place in it."""
 
 import csv
 import zipfile
@@ -31,10 +31,10 @@ def read_npz(
     text: Collection[str] = (),
     limits: MediaLimits = DEFAULT_LIMITS,
 ) -> dict[str, NDArray[Any]]:
-    """The members of a .npz that are `wanted`, of numbers, or in `text`, of words.
+    """The members of a .npz named in `wanted` (numbers) or in `text` (words).
 
-    A member that is not there is left out, but one of them has to be. Raises `RecordingError`
-    naming file and member where it is truncated, damaged, larger than the limits, or of another
+    A missing member is left out, but at least one must be there. Raises `RecordingError`, which
+    names file and member, where one is truncated, damaged, larger than the limits, or of another
     type; object arrays are refused unread.
     """
     members: dict[str, NDArray[Any]] = {}
@@ -65,7 +65,7 @@ def read_npy(path: Path, limits: MediaLimits = DEFAULT_LIMITS) -> Numbers:
 
 
 def _read_array(file: IO[bytes], size: int, where: str) -> NDArray[Any]:
-    """The array of numbers or words that fills the bytes of an open file."""
+    """The array of numbers or words in an open file of `size` bytes."""
     try:
         shape, _, dtype = _HEADERS[npy.read_magic(file)](file)
     except Exception:  # A damaged header makes numpy's parser raise almost any exception.
@@ -85,7 +85,7 @@ def _read_array(file: IO[bytes], size: int, where: str) -> NDArray[Any]:
 
 
 def member(members: Mapping[str, Numbers], names: Sequence[str], path: Path) -> Numbers:
-    """The member under the first of its possible names; `RecordingError` where it has none."""
+    """The member under the first of these names that exists; `RecordingError` if none does."""
     for name in names:
         if name in members:
             return members[name]
@@ -95,7 +95,7 @@ def member(members: Mapping[str, Numbers], names: Sequence[str], path: Path) -> 
 
 
 def numeric(array: Any, where: str) -> Numbers:
-    """The array, if it holds rows of real numbers."""
+    """The array; `RecordingError` unless it holds rows of real numbers."""
     if not isinstance(array, np.ndarray) or array.dtype.kind not in "fiu":
         kind = getattr(array, "dtype", type(array).__name__)
         raise RecordingError(f"{where}: expected an array of numbers, found {kind}")
@@ -119,8 +119,8 @@ def csv_header(path: Path) -> list[str]:
 def read_csv(path: Path, columns: Sequence[str]) -> NDArray[np.float64]:
     """The named columns (row, column) of a CSV with a header line, found by name.
 
-    Raises `RecordingError` naming columns that are missing or stand twice, the line of a row that
-    is longer or shorter than the header, or the line and column of a bad cell.
+    Raises `RecordingError`, which names missing or repeated columns, the line of a row that is
+    longer or shorter than the header, or the line and column of a bad cell.
     """
     lines = _csv_lines(path)
     header = [name.strip() for name in next(lines, (0, []))[1]]
@@ -136,7 +136,7 @@ def read_csv(path: Path, columns: Sequence[str]) -> NDArray[np.float64]:
     for line, row in lines:
         _check_width(path, line, row, header)
         try:
-            # Python's own way to write thousands, and digits of other scripts, are none in a table.
+            # float() also accepts 1_000 and digits of other scripts; a table may not have them.
             table.extend(float(row[place].replace("_", "?").encode("ascii")) for place in places)
         except ValueError:
             column = len(table) % len(columns)
@@ -169,8 +169,8 @@ def _bounded_lines(file: IO[str], path: Path) -> Iterator[str]:
 def _check_width(path: Path, line: int, row: Sequence[str], header: Sequence[str]) -> None:
     """Raise `RecordingError` for a row of more or fewer cells than the header names.
 
-    Which cell is missing or too many cannot be known, so every channel may be a neighbour's. Empty
-    cells at the end, as a last comma makes them, shift nothing.
+    It is unknown which cell is missing or extra, so every value may belong to a neighbouring
+    channel. Empty cells at the end, from a trailing comma, shift nothing.
     """
     expected = len(header)
     if len(row) != expected and any((*row[expected:], *header[len(row) :])):

@@ -17,7 +17,7 @@ from pipeline.data import lerobot, pickled, raw, windowed
 from pipeline.data.recording import Recording, absolute, entries, natural_key
 
 Opener = Callable[[Path, Source, Sequence[str] | None], tuple[Sequence[Recording], Sequence[str]]]
-"""The episodes of a folder, and lines about those that are not there."""
+"""Opens a folder: its episodes, and one line for each missing episode."""
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ class FormatReader:
 
 
 def _one(episode: Callable[[Path, Source, Sequence[str] | None], Recording]) -> Opener:
-    """The opener of a format with one episode a folder."""
+    """The opener of a format with one episode per folder."""
     return lambda path, source, views: ([episode(path, source, views)], [])
 
 
@@ -51,7 +51,7 @@ _FOREIGN = {
     "*.npz *.npy *.csv *.tsv *.pkl *.pickle *.pt": "arrays or tables of another recorder",
     "*.mp4 *.avi *.mkv *.mov *.webm *.jpg *.jpeg *.png": "images alone, without their actions",
 }
-"""Formats without a reader, by the names of their files; the first match decides."""
+"""Formats without a reader, by file name patterns; the first match decides."""
 
 _ON_THE_HUB = (
     "A data set on the Hugging Face hub has to lie here first: hf download --repo-type dataset "
@@ -61,7 +61,7 @@ _ON_THE_HUB = (
 _ODD = re.compile(r"[\x00-\x1f\x7f\ud800-\udfff]")
 """Control characters, and bytes of a name that are not UTF-8."""
 _MOST_LOOKED_AT = 1000
-"""Folders searched for such names."""
+"""Most folders searched for such names."""
 _DEEPEST = 4
 """Levels below a LeRobot root at which its files lie: videos/chunk-000/view/episode.mp4."""
 
@@ -69,8 +69,8 @@ _DEEPEST = 4
 def episode_folders(source: Source, root: Path) -> list[tuple[Path, FormatReader]]:
     """The source's episode folders and LeRobot roots, each once, in natural order.
 
-    Raises `RecordingError` where a path has none, and where a name is not UTF-8 or holds control
-    characters: a store could not keep it.
+    Raises `RecordingError` where a path has none, and where a name is not UTF-8 or has control
+    characters, because a store could not keep it.
     """
     unique: dict[Path, tuple[Path, FormatReader]] = {}
     for pattern in source.paths:
@@ -101,7 +101,7 @@ def episode_folders(source: Source, root: Path) -> list[tuple[Path, FormatReader
 
 
 def _matches(full: Path) -> list[Path]:
-    """The folders of a path or glob; a final `/**` is left out: all below is searched."""
+    """The folders of a path or glob; a final `/**` is dropped, because all below is searched."""
     if _is_folder(full):
         return [full]
     while full.name == "**":
@@ -112,11 +112,11 @@ def _matches(full: Path) -> list[Path]:
 
 
 def _is_folder(path: Path) -> bool:
-    return os.path.isdir(path)  # noqa: PTH112, which accepts a name that is too long
+    return os.path.isdir(path)  # noqa: PTH112, it accepts a name that is too long
 
 
 def _episodes(start: Path, source: Source) -> Iterator[tuple[Path, FormatReader]]:
-    """Episode folders at or below a folder; episodes themselves are not searched."""
+    """Episode folders at or below a folder; does not search inside an episode."""
     pending, seen = [start], set[tuple[int, int]]()
     while pending:
         folder = pending.pop()
@@ -151,7 +151,7 @@ def _detect(folder: Path, names: Collection[str], source: Source) -> str | None:
 
 
 def meant(path: Path) -> str:
-    """A hint about a path without an episode: what it lies in or looks like; '' if unknown."""
+    """A hint about a path without an episode: its parent episode or its format; '' if unknown."""
     for folder in path.parents[:_DEEPEST]:
         if not (folder.is_dir() and os.access(folder, os.R_OK)):
             continue
@@ -163,9 +163,9 @@ def meant(path: Path) -> str:
 
 
 def _foreign(path: Path) -> str:
-    """The format of a folder or file without a reader, and what to do; '' if unknown.
+    """A hint about a format without a reader, and what to do; '' if unknown.
 
-    Zarr v3 groups, as this project's stores are, are passed over.
+    Zarr v3 groups, such as this project's stores, are skipped.
     """
     names = {path.name.lower()} if path.exists() else set[str]()
     for _, below, files in islice(os.walk(path), _MOST_LOOKED_AT):

@@ -1,4 +1,4 @@
-"""An episode: a recording's streams and ticks, read once, and what its channels are."""
+"""An episode: a recording's streams and ticks, read once, and its channels."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -31,7 +31,7 @@ class Embodiment:
         return cls(action, action_kind, **channels)
 
     def document(self) -> dict[str, dict[str, Any]]:
-        """Names and units by stream, and the kind of action, as a store keeps them."""
+        """Names and units of each stream and the kind of action, as a store keeps them."""
         document: dict[str, dict[str, Any]] = {}
         for stream in ("action", "sensor", "state"):
             channels: Channels = getattr(self, stream)
@@ -42,7 +42,7 @@ class Embodiment:
 
 @dataclass(frozen=True)
 class ReadEpisode:
-    """A recording, its ticks and its whole streams; None where it has no such stream."""
+    """A recording, its ticks and its complete streams; a stream is None where it has none."""
 
     recording: Recording
     timeline: Timeline
@@ -74,8 +74,8 @@ def read_episode(
 ) -> ReadEpisode:
     """Every stream of a recording and the ticks over it; no frame is decoded.
 
-    Raises `RecordingError` for what cannot be read or has no tick, and `ConfigError` where actions
-    are derived from poses and `action_hz` is None.
+    Raises `RecordingError` where the recording cannot be read or has no tick, and `ConfigError`
+    where actions are derived from poses and `action_hz` is None.
     """
     state, sensor = recording.state(), recording.sensor()
     line = build_timeline(recording, action_hz, vlm_reuse_count, action_rotation, state, sensor)
@@ -85,10 +85,10 @@ def read_episode(
 def common_embodiment(
     recordings: Sequence[tuple[Recording, Embodiment]], of: str, remedy: str
 ) -> Embodiment:
-    """The embodiment of all these recordings; where some lack a stream, that of the others.
+    """The embodiment that all these recordings share; a recording may lack a stream.
 
-    Raises `StoreMismatch` that names two recordings of one `of` (such as a store) that differ in
-    channels, units or kind of action, and ends with the `remedy`.
+    Raises `StoreMismatch`, which names two recordings that differ in channels, units or kind of
+    action, and ends with the `remedy`; `of` is the word for what they share, such as a store.
     """
     common: dict[str, Channels] = {}
     for stream in ("action", "state", "sensor"):

@@ -1,6 +1,7 @@
-"""Shared by the three formats of the needle-insertion recorder.
+"""What the three formats of the needle-insertion recorder share.
 
-Channels, the task folder's name as instruction, JPEG views, robot states and sensor rows.
+These are the channels, the task folder's name as instruction, JPEG views, robot states and sensor
+rows.
 """
 
 import os
@@ -38,8 +39,8 @@ SENSOR = Channels(
 )
 CLOCK = "origin_timestamp"
 _CLOCK_TOLERANCE_S, _CLOCK_TOLERANCE = 0.5, 0.02
-"""Largest distance from the end of a clock made of start and rate to the recording's end: in
-seconds, or as a share of the recording where that is more."""
+"""Largest allowed distance from the end of a clock made from start and rate to the recording's end:
+in seconds, or as a share of the recording if that is more."""
 
 
 class InsertionRecording(Recording):
@@ -58,7 +59,7 @@ class InsertionRecording(Recording):
     def files(self) -> list[Path]:
         data = (path for path in self._data_files() if path and os.path.lexists(path))
         views = (paths for view, paths in self._view_files().items() if self._wants(view))
-        # By their names: paths take ten times as long to compare.
+        # Sorted as strings: to compare paths takes ten times as long.
         named = {str(path): path for path in chain(data, *views)}
         return [path for _, path in sorted(named.items())]
 
@@ -77,17 +78,17 @@ class InsertionRecording(Recording):
 
     @abstractmethod
     def _view_files(self) -> Mapping[str, list[Path]]:
-        """JPEGs by view; a view without any is left out."""
+        """JPEGs by view; a view without JPEGs is left out."""
 
     @abstractmethod
     def _data_files(self) -> Sequence[Path | None]:
-        """Paths of the files that are not frames, there or not."""
+        """Paths of the files that are not frames, whether they exist or not."""
 
 
 def promised(metadata: Document, **keys: Sequence[str]) -> dict[str, str]:
-    """The evidence in the metadata that a stream was recorded: the first of its keys that is set.
+    """The metadata entry which says that a stream was recorded: the first of its keys that is set.
 
-    A stream whose first such key is 0 or false is left out.
+    A stream is left out if that entry is 0 or false.
     """
     evidence: dict[str, str] = {}
     for stream, names in keys.items():
@@ -99,7 +100,7 @@ def promised(metadata: Document, **keys: Sequence[str]) -> dict[str, str]:
 
 
 def robot_state_file(folder: Path) -> Path | None:
-    """`robot_states.npz`, else `robot_states.csv`, else None."""
+    """`robot_states.npz`, else `robot_states.csv`; None where neither exists."""
     for name in ("robot_states.npz", "robot_states.csv"):
         if os.path.lexists(folder / name):
             return folder / name
@@ -113,9 +114,9 @@ def read_robot_states(
     rate_hz: float | None,
     end: float | None = None,
 ) -> Stream:
-    """Joints and poses; without a clock of its own, row i is at `start + i / rate_hz`.
+    """Joints and poses; if the file has no clock, row i is at `start + i / rate_hz`.
 
-    Such a clock has to reach `end`, if the recording names one; raises `RecordingError` otherwise.
+    Such a clock must reach `end`, if the recording names one; raises `RecordingError` otherwise.
     """
     if path.suffix == ".csv" and CLOCK in csv_header(path):
         return read_state_csv(path)

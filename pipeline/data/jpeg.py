@@ -1,4 +1,4 @@
-"""Folders of JPEGs as camera streams: the time of a frame stands in its file's name."""
+"""Folders of JPEGs as camera streams: a frame's time is in its file's name."""
 
 import math
 import os
@@ -27,9 +27,9 @@ Frame = TypeVar("Frame")
 Seen = TypeVar("Seen")
 _EYES = ("left", "right")
 _SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".gif", ".tif", ".tiff", ".webp")
-"""Suffixes of images; files that are not decoded are refused by name."""
+"""Suffixes of images; those that cannot be decoded are refused with their name."""
 _PADDED = re.compile(r"0\d+")
-"""A number in place of a time: 000001."""
+"""A frame number in place of a time: 000001."""
 _COUNTS = 1e6
 """Whole numbers below it count frames; a clock in whole seconds since 1970 is above 1e9."""
 _VIEW = re.compile(r"view(?=\d)", re.IGNORECASE)
@@ -43,8 +43,8 @@ class JpegCamera(CameraStream):
     ) -> None:
         """Sorts the files by the time in their names.
 
-        Raises `RecordingError` on a name without a time, where names count the frames, and where
-        the frames are of two cameras.
+        Raises `RecordingError` on a name without a time, on names that count the frames, and on
+        frames of two cameras.
         """
         timed = sorted((frame_time(path), str(path)) for path in paths)
         _check_one_camera(view, timed)
@@ -67,7 +67,7 @@ class JpegCamera(CameraStream):
             yield frame
 
     def repeats(self) -> NDArray[np.bool_]:
-        """Whether files are the same byte by byte; only those of equal length are read."""
+        """Whether files are equal byte by byte; reads only files of equal length."""
         lengths = np.array([check_image_file(path, self._limits) for path in self.paths])
         same = lengths[1:] == lengths[:-1]
         for place in np.flatnonzero(same):
@@ -91,7 +91,7 @@ def frame_time(path: PurePath) -> float:
 
 
 def _check_not_counted(timed: Sequence[tuple[float, str]]) -> None:
-    """Raise `RecordingError` where the names of frames, by time, count: whole numbers below 1e6."""
+    """Raise `RecordingError` where the names only count the frames: whole numbers below 1e6."""
     if len(timed) < 2 or timed[-1][0] >= _COUNTS:
         return
     if all(PurePath(path).stem.rpartition("_")[2].isdecimal() for _, path in timed):  # not 1.0
@@ -107,9 +107,9 @@ def _no_time(path: PurePath, found: str) -> RecordingError:
 
 
 def _check_one_camera(view: str, timed: Sequence[tuple[float, str]]) -> None:
-    """Raise `RecordingError` where frames, by time, are of two cameras or in two forms.
+    """Raise `RecordingError` where frames (sorted by time) are of two cameras or in two forms.
 
-    Before the time in its name, each has that of its camera, or a number of its own.
+    The part of a name before the time is the camera's name, or a number of the frame's own.
     """
     names = {path: os.path.basename(path).rpartition("_")[0] for _, path in timed}  # noqa: PTH119
     of_camera = {name: path for path, name in names.items()}
@@ -128,10 +128,10 @@ def _two_cameras(view: str, first: str | Path, other: str | Path) -> RecordingEr
 
 
 def list_views(folder: Path, prefix: str = "") -> dict[str, list[Path]]:
-    """Images by view name, from the folders `<prefix>…` in `folder`; views without are absent.
+    """Images by view name, from the folders `<prefix>…` in `folder`; without empty views.
 
-    `left` is dropped unless both eyes exist; an eye is a subfolder, the end of the folder's name,
-    or the part before the time in a file's name.
+    `left` is dropped unless both eyes exist. The eye is a subfolder, the end of the folder's name,
+    or the part of a file's name before the time.
     """
     frames: dict[tuple[str, str], list[Path]] = defaultdict(list)
     for view in _view_folders(folder, prefix):
@@ -147,7 +147,7 @@ def list_views(folder: Path, prefix: str = "") -> dict[str, list[Path]]:
 
 
 def list_empty_views(folder: Path, prefix: str = "") -> list[str]:
-    """The folders `<prefix>…` in `folder` without a JPEG in them or in their eyes' subfolders."""
+    """The folders `<prefix>…` in `folder` with no image in them or their eyes' subfolders."""
     return [
         view.name for view in _view_folders(folder, prefix) if next(_frames(view), None) is None
     ]
@@ -163,7 +163,7 @@ def name_views(frames: Mapping[tuple[str, str], list[Frame]]) -> dict[str, list[
 
 
 def split_eye(name: str) -> tuple[str, str]:
-    """`View1_left` and `view1_left` -> (`View1`, `left`); no eye is ''."""
+    """`View1_left` and `view1_left` -> (`View1`, `left`); the eye is '' if there is none."""
     name = _VIEW.sub("View", name, count=1) if _VIEW.match(name) else name
     base, _, eye = name.rpartition("_")
     return (base, eye) if base and eye in _EYES else (name, "")
@@ -182,8 +182,8 @@ def check_image(
 ) -> NDArray[np.uint8] | None:
     """Raise `RecordingError` on an unreadable image.
 
-    A JPEG is decoded at an eighth of its size and gives some of its pixels, evenly spread, as a
-    `THUMBNAIL`; a PNG is judged by its checksums and gives None.
+    A JPEG is decoded at an eighth of its size; some of its pixels, evenly spread, are returned as a
+    `THUMBNAIL`. A PNG is checked by its checksums and returns None.
     """
     with opened_image(file, where, limits) as image:
         if image.format == "PNG":

@@ -1,9 +1,9 @@
 """LeRobot data sets v2.0, v2.1 and v3.0: state and action from parquet, frames from video.
 
-Rows and frames pair by number; the `timestamp` column is the clock, as `lerobot_rows` reads it.
-This project's sidecars, beside the data set's own folders, hold what has no place in LeRobot:
-`sensor/episode_000003.npz` a high-rate sensor, `state/…` states that are faster than the rows,
-`frames/…` when the images in the rows were captured.
+Rows and frames pair by number; the `timestamp` column is the clock, which `lerobot_rows` reads.
+This project's sidecar files, beside the data set's own folders, hold data for which LeRobot has no
+place: `sensor/episode_000003.npz` has a high-rate sensor, `state/…` states faster than the rows,
+`frames/…` the capture times of the images in the rows.
 """
 
 import json
@@ -71,7 +71,7 @@ def is_root(folder: Path, names: Collection[str]) -> bool:
 def open_data_set(
     root: Path, source: Source, views: Sequence[str] | None
 ) -> tuple[list["LeRobotRecording"], list[str]]:
-    """The episodes whose files are there, and a line for each listed one whose files are not.
+    """The episodes whose files exist, and one line for each listed episode whose files do not.
 
     Raises `RecordingError` where `meta/` is broken, and where `views` names a depth map.
     """
@@ -96,7 +96,7 @@ def open_data_set(
 
 
 def _refusal(path: Path) -> str:
-    """Why a file cannot hold an episode; empty where it can."""
+    """Why a file cannot hold an episode; '' where it can."""
     try:
         RECORDINGS.check_file(path)
     except RecordingError as error:
@@ -150,9 +150,9 @@ class LeRobotRecording(Recording):
         return sorted({self._rows.path, *videos, *sidecars})
 
     def identity(self) -> str:
-        """The parts of `meta/` that decide what is read of the episode's files.
+        """The parts of `meta/` that decide what is read from the episode's files.
 
-        The whole of `meta/` changes whenever an episode is added.
+        It is not all of `meta/`, which changes whenever an episode is added.
         """
         read = {STATE, ACTION, *self._wanted().values()}
         deciding = {
@@ -169,7 +169,7 @@ class LeRobotRecording(Recording):
         self._check_spans()
         where, table, time = self._numbers(())
         if not np.array_equal(time, stored_clock(table, where)):
-            # Stores that were built before clocks were made exact hold other times.
+            # Stores of versions before exact clocks hold other times.
             described += " clock=frame_index/fps"
         if not self._info.shared:
             return described
@@ -200,7 +200,7 @@ class LeRobotRecording(Recording):
         return Nominal(where=MARKER, mistakes=self._misplaced_rows())
 
     def _misplaced_rows(self) -> tuple[str, ...]:
-        """A message where `meta/` names another file than the one that holds the rows."""
+        """A message if `meta/` names another file than the one with the rows."""
         rows, listed = self._rows.path, self._meta.data(self._entry)
         if rows == listed:
             return ()
@@ -277,7 +277,7 @@ class LeRobotRecording(Recording):
     def _numbers(
         self, streams: Sequence[str] = (STATE, ACTION)
     ) -> tuple[str, pa.Table, NDArray[np.float64]]:
-        """The place of the episode's rows for messages, these columns of them, and their clock."""
+        """The place of the episode's rows (for messages), these columns, and the clock."""
         rows = self._rows
         table = rows.columns((CLOCK, FRAME, *streams))
         check_frames(table, rows)
@@ -285,13 +285,13 @@ class LeRobotRecording(Recording):
         return where, table, read_clock(table, self._info.fps, where)
 
     def _sidecar(self, name: str) -> Path | None:
-        """The episode's file of that name, where there is one."""
+        """The episode's sidecar file of that name; None where there is none."""
         path = sidecar(self.path, name, self._entry.index)
         return path if os.path.lexists(path) else None
 
 
 def action_kind(names: Sequence[str]) -> ActionKind:
-    """The kind of action that the names of its channels tell; absolute where they tell none."""
+    """The kind of action by the names of its channels; absolute where they do not say."""
     lower = [name.lower() for name in names]
     if any("vel" in name for name in lower):
         return "velocity"
@@ -299,7 +299,7 @@ def action_kind(names: Sequence[str]) -> ActionKind:
 
 
 def _read_sidecar(path: Path, limits: MediaLimits) -> Stream:
-    """The stream of a file with `timestamps` and `values`, and perhaps `names` and `units`."""
+    """The stream of a file with `timestamps`, `values` and optional `names` and `units`."""
     members = read_npz(path, ("timestamps", "values"), text=("names", "units"), limits=limits)
     values = member(members, ("values",), path)
     if values.ndim != 2:
@@ -318,7 +318,7 @@ def _read_sidecar(path: Path, limits: MediaLimits) -> Stream:
 def _channels(
     stem: str, width: int, names: tuple[str, ...] | None, units: tuple[str, ...] | None, where: str
 ) -> Channels:
-    """Channels of these names and units, numbered after the stem where there are none."""
+    """Channels with these names and units; without names, the stem and a number."""
     if width > MOST_CHANNELS:
         raise META.refusal(where, f"expected at most {MOST_CHANNELS:,} channels, found {width:,}")
     names = names or tuple(f"{stem}_{channel}" for channel in range(width))

@@ -1,7 +1,8 @@
-"""A LeRobot data set's `meta/`: its documents as models, and where each episode's data lies.
+"""A LeRobot data set's `meta/`: its documents as models, and the place of each episode's data.
 
-v2.0 and v2.1 keep a file an episode, v3.0 many episodes a file. Only `meta/` is read here. `group`
-of an episode, and `units` and `kind` of a feature are this project's extensions.
+v2.0 and v2.1 have one file per episode, v3.0 many episodes per file. This module reads only
+`meta/`. The `group` of an episode and the `units` and `kind` of a feature are this project's
+extensions.
 """
 
 import re
@@ -36,22 +37,22 @@ _MOST_ROWS = 500_000
 _ENTRY_COLUMNS = ("episode_index", "length", "tasks", "group")
 _TASK_COLUMNS = ("task_index", "task", "__index_level_0__")
 _OFF_FRAME = 0.1
-"""Share of a frame by which a sum of inexact durations may miss the frame's time."""
+"""Fraction of a frame by which a sum of inexact durations may miss the frame's time."""
 _VIEW_PREFIXES = ("observation.images.", "observation.")
 _PLACES = {"v2": "episode_chunk|episode_index", "v3": "chunk_index|file_index"}
-"""Numbers that a path may name, as in `{episode_index:06d}`."""
+"""Placeholders that a path may have, as in `{episode_index:06d}`."""
 
 Index = Annotated[
     int,
     Field(ge=0, lt=10**9),
     BeforeValidator(lambda n: int(n) if isinstance(n, float) and n.is_integer() else n),
 ]
-"""A float without a fraction is taken too: pandas makes them of whole columns."""
+"""A whole float is accepted too, because pandas turns integer columns into floats."""
 Seconds = Annotated[float, Field(ge=0, le=1e9)]
 
 
 def _flat_names(names: Any) -> Any:
-    """Channel names from a list, a list in a list or a dict of lists; the rest is refused later."""
+    """Channel names from a list, a nested list or a dict of lists; others are refused later."""
     if isinstance(names, dict):
         named_lists = all(isinstance(value, list) for value in names.values())
         names = list(names.values() if named_lists else names)
@@ -62,7 +63,7 @@ def _flat_names(names: Any) -> Any:
 
 
 def sidecar(root: Path, name: str, index: int = 0) -> Path:
-    """This project's file beside a data set of that name, for an episode; there or not."""
+    """The path of an episode's sidecar file `name`, whether it exists or not."""
     return root / name / f"episode_{index:06d}.npz"
 
 
@@ -81,14 +82,14 @@ class Feature(Document):
     names: JsonValue = None
     units: tuple[Text, ...] | None = None
     kind: ActionKind | None = None
-    """The kind of the actions; None where their names tell it."""
+    """The kind of the actions; None means that their names decide."""
     info: _VideoInfo | None = None
     video_info: _VideoInfo | None = None
-    """The name of `info` in sets that were migrated from v1."""
+    """The name of `info` in data sets migrated from v1."""
 
     @property
     def is_depth_map(self) -> bool:
-        """Whether its pictures are of depth, by any of the words for it."""
+        """Whether its images are depth maps, by any of the entries for it."""
         infos = [info for info in (self.info, self.video_info) if info is not None]
         return any(info.depth or info.video_depth for info in infos)
 
@@ -128,7 +129,7 @@ class Info(Document):
 
     @cached_property
     def depth(self) -> dict[str, str]:
-        """Feature keys of the depth maps, which are no views, by view name."""
+        """Feature keys of the depth maps, by view name; they are not views."""
         return self._cameras(depth=True)
 
     def _cameras(self, depth: bool) -> dict[str, str]:
@@ -170,14 +171,14 @@ class Place(Document):
 
 
 class Span(Place):
-    """Frames of a video of v3.0, by the seconds in it."""
+    """An episode's frames in a video of v3.0, in seconds of the video."""
 
     from_timestamp: Seconds
     to_timestamp: Seconds
 
 
 class Entry(Grouped):
-    """An episode as a line of `meta/episodes.jsonl`: its files are its own."""
+    """An episode as a line of `meta/episodes.jsonl`; it shares no file."""
 
     index: Index = Field(alias="episode_index")
     length: Index
@@ -185,15 +186,15 @@ class Entry(Grouped):
 
     @property
     def id(self) -> str:
-        """As in `episode_000003`."""
+        """Such as `episode_000003`."""
         return f"episode_{self.index:06d}"
 
     def place(self, chunks_size: int, key: str | None = None) -> dict[str, int]:
-        """The numbers in the path of its rows, or of its frames of a feature."""
+        """The numbers in the path of its rows, or of its video of feature `key`."""
         return {"episode_index": self.index, "episode_chunk": self.index // chunks_size}
 
     def frames(self, key: str, fps: float) -> tuple[int | None, int | None]:
-        """The number of its first frame in the video of a feature, and its count; None: all."""
+        """The number of its first frame in the video of a feature, and the count; None: all."""
         return None, None
 
 
@@ -208,13 +209,13 @@ class SharedEntry(Entry):
         return {"chunk_index": place.chunk_index, "file_index": place.file_index}
 
     def frames(self, key: str, fps: float) -> tuple[int | None, int | None]:
-        # Rounded to frame numbers: the timestamps are inexact sums such as 36.900000000000006.
+        # Rounded, because the timestamps are inexact sums such as 36.900000000000006.
         begin, end = self.videos[key].from_timestamp, self.videos[key].to_timestamp
         return round(begin * fps), round((end - begin) * fps)
 
 
 class Task(Document):
-    """A line of `meta/tasks.jsonl`, a row of `meta/tasks.parquet`."""
+    """A line of `meta/tasks.jsonl` or a row of `meta/tasks.parquet`."""
 
     index: Index = Field(alias="task_index")
     # Up to lerobot 0.4.4 the column was an unnamed index of pandas.
@@ -223,7 +224,7 @@ class Task(Document):
 
 @dataclass(frozen=True)
 class LeRobotMeta:
-    """A data set: what all its episodes share, and where each of them lies."""
+    """A data set: what its episodes share, and where each of them is."""
 
     root: Path
     info: Info
@@ -244,11 +245,11 @@ class LeRobotMeta:
         return VideoSpan(self.root / path, *entry.frames(key, self.info.fps))
 
     def check_ends(self) -> None:
-        """Raise `RecordingError` where a video ends before its episodes do and the first of them
-        does not begin with it: the frames of all would be those of others.
+        """Raise `RecordingError` where a video is too short and no episode begins at its start.
 
-        A video whose first episode begins with it may be cut off; one that reaches its last
-        episode's end may be of a trimmed copy.
+        Its episodes would then get frames of others. A video whose first episode begins at frame 0
+        may be truncated, and one that reaches its last episode's end may belong to a trimmed copy:
+        both pass.
         """
         for path, spans in self._spans.items():
             first, stop = spans[0][0], spans[-1][0] + spans[-1][3].length
@@ -259,7 +260,7 @@ class LeRobotMeta:
 
     @cached_property
     def _spans(self) -> Mapping[Path, list[tuple[int, int, str, Entry]]]:
-        """By video, in order: (first frame, index, feature key, episode)."""
+        """For each video, in order: (first frame, index, feature key, episode)."""
         spans: dict[Path, list[tuple[int, int, str, Entry]]] = defaultdict(list)
         for entry in self.entries:
             for key in self.info.videos:
@@ -269,7 +270,7 @@ class LeRobotMeta:
 
     @cached_property
     def rivals(self) -> Mapping[tuple[int, str], str]:
-        """By an episode's index and a feature key: another episode that shares some frames."""
+        """(episode index, feature key) -> another episode that shares some of its frames."""
         rivals: dict[tuple[int, str], str] = {}
         for spans in self._spans.values():
             until, last = 0, ("", spans[0][-1])
@@ -282,10 +283,10 @@ class LeRobotMeta:
 
 
 def read_meta(root: Path, limits: MediaLimits) -> LeRobotMeta:
-    """The data set as its `meta/` describes it.
+    """The data set that its `meta/` describes.
 
-    Raises `RecordingError` naming the file of `meta/` that is wrong, and the place in it: also
-    where two cameras would be one view, or an episode is listed twice.
+    Raises `RecordingError`, which names the wrong file of `meta/` and the place in it, also where
+    two cameras would be one view or an episode is listed twice.
     """
     info = META.read_json(root / MARKER, Info, _INFO_BYTES)
     path = root / "meta" / ("episodes" if info.shared else "episodes.jsonl")
@@ -307,7 +308,7 @@ def _shared_entries(folder: Path, info: Info, limits: MediaLimits) -> Iterator[E
         for where, cells in ParquetTable(path, limits).rows(columns):
             row: dict[str, Any] = {"videos": {key: {} for key in info.videos}}
             for column, cell in cells.items():
-                *parents, name = column.split("/")  # no key has one
+                *parents, name = column.split("/")  # no key contains a slash
                 reduce(lambda inner, parent: inner.setdefault(parent, {}), parents, row)[name] = (
                     cell
                 )
@@ -322,7 +323,7 @@ def _shared_entries(folder: Path, info: Info, limits: MediaLimits) -> Iterator[E
 
 
 def _task_text(root: Path, shared: bool, limits: MediaLimits) -> dict[int, str]:
-    """The tasks' texts by their index; none where there is no file of them."""
+    """The tasks' texts by index; empty where there is no such file."""
     path = root / "meta" / ("tasks.parquet" if shared else "tasks.jsonl")
     if not path.exists():
         return {}
@@ -339,7 +340,7 @@ def _task_text(root: Path, shared: bool, limits: MediaLimits) -> dict[int, str]:
 
 
 def _bounded(rows: Iterable[T], root: Path) -> list[T]:
-    """These rows of `meta/`; refused where they are more than any data set has."""
+    """These rows of `meta/`; refused where there are more than in any known data set."""
     some = list(islice(rows, _MOST_ROWS + 1))
     if len(some) > _MOST_ROWS:
         why = f"expected at most {_MOST_ROWS:,} episodes or tasks, found more"

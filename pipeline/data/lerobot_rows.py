@@ -1,7 +1,7 @@
 """The rows of one LeRobot episode in a parquet file: where they are, their columns and clock.
 
-LeRobot stores `timestamp` as float32, in which 0.1 is 0.10000000149. Where the stored times are
-those of the frame numbers at `fps`, the clock is computed from the numbers, without that rounding.
+LeRobot stores `timestamp` as float32, in which 0.1 is 0.10000000149. Where the stored times agree
+with frame number / `fps`, the clock is computed from the numbers, without that rounding.
 """
 
 from collections.abc import Iterator, Sequence
@@ -25,12 +25,12 @@ CLOCK = "timestamp"
 FRAME = "frame_index"
 EPISODE = "episode_index"
 _SAME_S = 1e-9
-"""Largest difference of two sums of steps in float64 that are the same time."""
+"""Largest difference of two float64 sums that count as the same time, in s."""
 _ROUNDINGS = 2
-"""Most steps of the stored type between a time and that of its frame number: the writer may have
+"""Most steps of the stored type between a time and its frame number's time: the writer may have
 multiplied by a rounded 1 / fps."""
 _LATEST_S = 1e12
-"""Nanoseconds reach it in a quarter of an hour: no clock is in seconds there."""
+"""A clock in nanoseconds passes it after a quarter of an hour; one in seconds never does."""
 _UNITS = {"milliseconds": 1e3, "microseconds": 1e6, "nanoseconds": 1e9}
 
 
@@ -48,7 +48,7 @@ class ParquetRows:
         return self.table.path
 
     def columns(self, wanted: Sequence[str]) -> pa.Table:
-        """The wanted columns that the file has, (row,) each, of numbers or lists of them."""
+        """Those wanted columns that the file has, each (row,), with numbers or lists of numbers."""
         groups, offset = self.table.groups(self.start, self.stop)
         rows = self.table.numbers(wanted, groups).slice(self.start - offset, self.stop - self.start)
         if rows.num_columns and rows.num_rows != self.stop - self.start:
@@ -57,7 +57,7 @@ class ParquetRows:
         return rows
 
     def images(self, column: str, rows: Sequence[int]) -> Iterator[tuple[int, bytes]]:
-        """The encoded image of each row asked for (ascending, no twins), one row at a time."""
+        """The encoded image of each of these rows (ascending, none twice), one row at a time."""
         groups, offset = self.table.groups(self.start, self.stop)
         where = f"{self.path}, column {column!r}"
         asked = set(rows)
@@ -66,7 +66,7 @@ class ParquetRows:
             kind = file.schema_arrow.field(column).type if there else pa.null()
             if not isinstance(kind, pa.StructType) or kind.get_field_index("bytes") < 0:
                 raise RECORDINGS.refusal(where, f"expected images, found {shown(str(kind))}")
-            # One at a time: a single large image may stand in every row.
+            # One row at a time: a large image, stored once, may be in every row.
             batches = file.iter_batches(1, row_groups=groups, columns=[f"{column}.bytes"])
             for row, batch in enumerate(batches, offset - self.start):
                 if row not in asked:
@@ -93,11 +93,12 @@ class ParquetCamera(CameraStream):
         column: str,
         captured: NDArray[np.float64] | None = None,
     ) -> None:
-        """`time` and `captured` (row,) s: when rows were recorded, and their images captured.
+        """`time` and `captured` (row,) s: when rows were recorded, and when images were captured.
 
-        Without `captured`, each row has a frame of its own time. With it, rows whose images have
-        one time show one frame, which stands until the next. Raises `RecordingError` where there
-        are more or fewer of these times than rows, where they fall, or lie after their rows.
+        Without `captured`, each row has its own frame at its own time. With `captured`, rows with
+        the same capture time share one frame, which is shown until the next. Raises
+        `RecordingError` where the number of capture times is not that of the rows, or where they
+        decrease or are later than their rows.
         """
         self.view = view
         self._rows = rows
@@ -111,7 +112,7 @@ class ParquetCamera(CameraStream):
             )
         where = f"{rows.path}, the times of the images of {view!r}"
         check_clock(own, where)
-        if captured is not None:  # one image may stand in many rows: those times are repeated
+        if captured is not None:  # one image may be in many rows, so times repeat
             check_resolution(time.astype(captured.dtype), where)
         if (late := np.flatnonzero(own > time + _SAME_S)).size:
             row = int(late[0])
@@ -147,11 +148,11 @@ class ParquetCamera(CameraStream):
 
 
 def find_rows(meta: LeRobotMeta, entry: Entry) -> ParquetRows:
-    """The episode's rows, found by their `episode_index`; the whole file where it has none.
+    """The episode's rows, found by `episode_index`; the whole file if it has no such column.
 
-    The metadata's file_index can be stale (lerobot up to 0.4.4), so where the file named has none
-    of the rows, the other data files of v3.0 are searched. Raises `RecordingError` naming both
-    counts where they are not as many as `meta/` says, or not together.
+    The metadata's file_index can be stale (lerobot up to 0.4.4), so if the named file has none of
+    the rows, the other data files of v3.0 are searched. Raises `RecordingError` where the rows are
+    not as many as `meta/` says (with both counts), or not together.
     """
     shared, named = meta.info.shared, meta.data(entry)
     others = sorted((meta.root / "data").glob("*/*.parquet"), key=natural_key) if shared else []
@@ -179,7 +180,7 @@ def find_rows(meta: LeRobotMeta, entry: Entry) -> ParquetRows:
 
 
 def matrix(column: pa.ChunkedArray, width: int, where: str) -> NDArray[np.float64]:
-    """A column of vectors, or of numbers where the width is 1, as (row, width)."""
+    """A column of vectors, or of numbers if the width is 1, as (row, width)."""
     array = column.combine_chunks()
     if array.null_count:
         raise RECORDINGS.refusal(where, f"no value in row {int(np.argmax(array.is_null()))}")
@@ -198,7 +199,7 @@ def matrix(column: pa.ChunkedArray, width: int, where: str) -> NDArray[np.float6
 
 
 def _numbers(array: pa.Array) -> NDArray[Any]:
-    """An array of numbers, NaN where there is none; `to_numpy` would import pandas."""
+    """An array of numbers, NaN for a null; not with `to_numpy`, which would import pandas."""
     if array.null_count:
         array = array.cast(pa.float64()).fill_null(np.nan)
     dtype = np.dtype(array.type.to_pandas_dtype())
@@ -206,7 +207,7 @@ def _numbers(array: pa.Array) -> NDArray[Any]:
 
 
 def read_clock(table: pa.Table, fps: float, where: str) -> NDArray[np.float64]:
-    """(row,) s, rising: from frame numbers and `fps` where they agree with the stored times.
+    """(row,) s, rising; from frame numbers and `fps` if these agree with the stored times.
 
     Raises `RecordingError` where the clock does not rise or is not in seconds.
     """
@@ -215,13 +216,13 @@ def read_clock(table: pa.Table, fps: float, where: str) -> NDArray[np.float64]:
     check_resolution(stored.astype(_stored_type(table)), f"{where}, {CLOCK!r}")
     _check_seconds(stored, fps, where)
     time = _exact(stored, _stored_type(table), _frames(table, where), fps)
-    # Rows are chosen by time: of two at one time, the earlier would show the later's frame.
+    # Rows are chosen by time: of two rows at one time, the earlier would get the later's frame.
     check_clock(time, f"{where}, {CLOCK!r}", rising=True)
     return time
 
 
 def stored_clock(table: pa.Table, where: str) -> NDArray[np.float64]:
-    """(row,) the column `timestamp` of the file, s."""
+    """(row,) s, the column `timestamp` as stored."""
     if CLOCK not in table.column_names:
         raise RECORDINGS.refusal(where, f"missing column {CLOCK!r}")
     where += f", {CLOCK!r}"
@@ -235,7 +236,7 @@ def stored_clock(table: pa.Table, where: str) -> NDArray[np.float64]:
 def check_frames(table: pa.Table, rows: ParquetRows) -> None:
     """Raise `RecordingError` where frame numbers do not rise.
 
-    They may begin above 0 and have gaps: rows can have been removed.
+    They may begin above 0 and have gaps, because rows may have been removed.
     """
     frame = _frames(table, str(rows.path))
     if (fallen := np.flatnonzero(~(np.diff(frame) > 0))).size:
@@ -248,7 +249,7 @@ def check_frames(table: pa.Table, rows: ParquetRows) -> None:
 
 
 def _frames(table: pa.Table, where: str) -> NDArray[np.float64]:
-    """(row,) the frame numbers; the rows' own where the column is absent."""
+    """(row,) the frame numbers; the row numbers where the column is absent."""
     if FRAME not in table.column_names:
         return np.arange(table.num_rows, dtype=np.float64)
     return matrix(table[FRAME], 1, f"{where}, {FRAME!r}")[:, 0]
@@ -264,10 +265,10 @@ def _stored_type(table: pa.Table) -> "np.dtype[Any]":
 def _exact(
     stored: NDArray[np.float64], dtype: "np.dtype[Any]", frame: NDArray[np.float64], fps: float
 ) -> NDArray[np.float64]:
-    """`offset + frame / fps` where all stored times differ from it by the rounding of `dtype` only.
+    """`offset + frame / fps` if all stored times differ from it only by the rounding of `dtype`.
 
-    The offset is a whole number of frames, or the shortest decimal that is stored as the first
-    time. Other times, and those of float64, stay as they are.
+    The offset is a whole number of frames, or the shortest decimal that rounds to the first time.
+    Otherwise, and for float64, the stored times are returned.
     """
     if dtype == np.float64:
         return stored

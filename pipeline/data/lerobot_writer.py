@@ -1,9 +1,9 @@
-"""LeRobot data sets and this project's sidecars beside them, as its own reader opens them.
+"""Writes LeRobot data sets, and this project's sidecars beside them, for its own reader.
 
-`write_v21` writes many episodes, with a video a view; `write_v30` writes one, with the images in
-its rows as they were encoded. `meta/info.json` comes last: until then the folder does not look like
-a recording. `units` and `kind` of a feature are this project's extension; other readers pass over
-them.
+`write_v21` writes many episodes, with one video per view; `write_v30` writes one episode, with the
+encoded images unchanged in its rows. `meta/info.json` is written last: until then the folder does
+not look like a recording. `units` and `kind` of a feature are this project's extension; other
+readers ignore them.
 """
 
 import json
@@ -21,9 +21,9 @@ from numpy.typing import NDArray
 from pipeline.data.lerobot_meta import MARKER, sidecar
 
 Columns = Mapping[str, NDArray[Any]]
-"""By feature key: (row,) or (row, channel), `timestamp` (s since the first row) among them."""
+"""Feature key -> (row,) or (row, channel), with `timestamp` (s since the first row)."""
 Features = Mapping[str, Mapping[str, Any]]
-"""By feature key: entries of `info.json` beside type and shape."""
+"""Feature key -> its entries in `info.json` besides type and shape."""
 
 _DATA: Final = {
     "v2.1": "data/chunk-{episode_chunk:03d}/episode_{episode_index:06d}.parquet",
@@ -32,9 +32,9 @@ _DATA: Final = {
 _VIDEO: Final = "videos/chunk-{episode_chunk:03d}/{video_key}/episode_{episode_index:06d}.mp4"
 _NUMBERING: Final = ("timestamp", "frame_index", "episode_index", "index", "task_index")
 _STATISTICS_EVERY: Final = 10
-"""Frames between those that image statistics are taken from."""
+"""Image statistics use every tenth frame."""
 _IMAGES_A_GROUP: Final = 64
-"""Images in a row group: equal images are stored once a group, which is held in memory."""
+"""Images in a row group: equal images are stored once per group, and a group is held in memory."""
 _DICTIONARY_BYTES: Final = 2**30
 _FIRST: Final = {"chunk_index": 0, "file_index": 0}
 _IMAGE: Final = pa.struct(
@@ -43,7 +43,7 @@ _IMAGE: Final = pa.struct(
 
 
 class FilmedRows(NamedTuple):
-    """The rows of one episode, and by feature key a frame (row, height, width, 3) RGB for each."""
+    """The rows of one episode, and for each feature key its frames (row, height, width, 3) RGB."""
 
     columns: Columns
     frames: Mapping[str, NDArray[np.uint8]]
@@ -57,7 +57,7 @@ def write_v21(
     fps: int,
     robot_type: str,
 ) -> None:
-    """Write a whole data set; episodes are taken one at a time."""
+    """Write a complete data set; reads one episode at a time from the iterable."""
     lengths: list[int] = []
     statistics: list[dict[str, Any]] = []
     described: dict[str, dict[str, Any]] = {}
@@ -96,10 +96,10 @@ def write_v30(
     task: str,
     fps: float,
 ) -> None:
-    """Write a data set of one episode; `images` has by feature key the image file of each row.
+    """Write a data set of one episode; `images` has each row's image file by feature key.
 
-    Equal images are stored once, by the dictionary of the parquet file, so that rows between two
-    frames cost next to nothing.
+    The parquet file's dictionary stores equal images once, so that rows between two frames cost
+    almost nothing.
     """
     columns = _numbered(columns, 0, 0)
     _write_rows(root / _DATA["v3.0"].format(**_FIRST), columns, images)
@@ -110,7 +110,7 @@ def write_v30(
     folder = root / "meta" / "episodes" / "chunk-000"
     folder.mkdir(parents=True)
     pq.write_table(pa.Table.from_pylist([counts | spans]), folder / "file-000.parquet")
-    # LeRobot looks tasks up by the index that pandas makes of this column.
+    # LeRobot finds tasks by the index that pandas makes from this column.
     column = {"name": "task", "field_name": "task"}
     column |= {"pandas_type": "unicode", "numpy_type": "object"}
     index = {"index_columns": ["task"], "columns": [column], "column_indexes": []}
@@ -128,7 +128,7 @@ def write_sidecar(
     index: int = 0,
     compressed: bool = False,
 ) -> None:
-    """Write what LeRobot has no place for."""
+    """Write an episode's data that have no place in LeRobot."""
     path = sidecar(root, name, index)
     path.parent.mkdir(parents=True, exist_ok=True)
     save = np.savez_compressed if compressed else np.savez
@@ -136,7 +136,7 @@ def write_sidecar(
 
 
 def _numbered(columns: Columns, episode: int, first: int) -> dict[str, NDArray[Any]]:
-    """The columns of an episode and, last, those by which LeRobot numbers its rows."""
+    """The columns of an episode and, last, LeRobot's columns that number the rows."""
     time = columns["timestamp"]
     numbers = [time, np.arange(len(time)), np.full(len(time), episode)]
     numbers += [first + np.arange(len(time)), np.zeros(len(time), np.int64)]
@@ -191,7 +191,7 @@ def _number_table(columns: Columns) -> pa.Table:
 
 
 def _write_video(path: Path, frames: NDArray[np.uint8], fps: int) -> None:
-    """H.264 with a key frame every other frame, as LeRobot does; one thread, so same bytes."""
+    """H.264 with a key frame every other frame, as in LeRobot; one thread gives the same bytes."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with av.open(str(path), "w") as container:
         stream = container.add_stream(
@@ -220,7 +220,7 @@ def _video_feature(frames: NDArray[np.uint8], fps: int) -> dict[str, Any]:
 
 
 def _statistics(columns: Columns, frames: Mapping[str, NDArray[np.uint8]]) -> dict[str, Any]:
-    """LeRobot's per-episode statistics; images in 0..1, a value a colour, shaped (3, 1, 1)."""
+    """LeRobot's statistics of an episode; images in 0..1, one value per colour, (3, 1, 1)."""
     stats: dict[str, Any] = {
         name: {**_of(values.reshape(len(values), -1)), "count": [len(values)]}
         for name, values in columns.items()
@@ -251,7 +251,7 @@ def _write_rows(path: Path, columns: Columns, images: Mapping[str, Sequence[Path
         changes += [file != before for before, file in pairwise([None, *files])]
     group = np.cumsum(changes) // _IMAGES_A_GROUP
     edges = [0, *(np.flatnonzero(np.diff(group)) + 1).tolist(), table.num_rows]
-    # Without this project's schema, in which the type would be that of a dictionary.
+    # Without arrow's schema, which would declare the type as a dictionary.
     how: dict[str, Any] = {"dictionary_pagesize_limit": _DICTIONARY_BYTES, "store_schema": False}
     with pq.ParquetWriter(path, schema, **how) as writer:
         for first, stop in pairwise(edges):
@@ -263,7 +263,7 @@ def _write_rows(path: Path, columns: Columns, images: Mapping[str, Sequence[Path
 
 def _cells(files: Sequence[Path]) -> pa.StructArray:
     encoded = {file: file.read_bytes() for file in dict.fromkeys(files)}
-    # Each image once: parquet takes no dictionary with twins, and would store every row.
+    # Each image once: parquet drops a dictionary with duplicates and would store every row.
     place = {image: index for index, image in enumerate(dict.fromkeys(encoded.values()))}
     rows = pa.array([place[encoded[file]] for file in files], pa.int32())
     images = pa.DictionaryArray.from_arrays(rows, pa.array(list(place), pa.binary()))

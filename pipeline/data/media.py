@@ -1,4 +1,4 @@
-"""The border of recordings: their refusals, and the limits of one of their files."""
+"""The border for recordings: how they are refused, and the limits of one of their files."""
 
 from collections.abc import Generator
 from contextlib import contextmanager
@@ -20,35 +20,35 @@ from pipeline.base.errors import RecordingError
 
 RECORDINGS = Border(RecordingError, "Copy the file again, or leave the episode out.")
 INTACT = Border(RecordingError, "Write the file again as expected, or leave the episode out.")
-"""Refuses a file that is whole: a copy would be refused, too."""
+"""Refuses an undamaged file; a new copy would be refused too."""
 
 DEFAULT_LIMITS = MediaLimits()
-"""Limits of a file that belongs to no source."""
+"""Limits of a file that does not belong to a source."""
 FARTHEST_S = 1e20
-"""No clock is farther from zero: nanoseconds since 1970 are 1e18."""
+"""Largest absolute time: nanoseconds since 1970 are 1e18."""
 Seconds = Annotated[float, Field(ge=-FARTHEST_S, le=FARTHEST_S)]
 Rate = Annotated[float, Field(ge=1e-3, le=1e6)]
 """Rate of a stream, in Hz."""
 
 _ALWAYS_TAKEN = 256 * 2**20
-"""Unpacked bytes that no ratio forbids: a constant stream packs a thousandfold."""
+"""Unpacked bytes that are allowed at any ratio: a constant stream is packed a thousandfold."""
 _IMAGES = ("JPEG", "PNG")
 _AS_RGB = ("1", "L", "LA", "P", "PA", "RGB", "RGBA", "CMYK")
 """Modes of images that are converted to RGB; transparent pixels become opaque."""
 _SIXTEEN_BITS = ("I;16", "I;16B", "I;16L", "I;16N")
-"""Modes of grey in 16 bits; the upper eight are kept."""
+"""Modes of grey images of 16 bits; the upper eight bits are kept."""
 _IMAGE_BYTES = 16 * 2**20
-"""Bytes that an image may have beside one for each pixel of the limits; a good JPEG has half."""
+"""Bytes that an image file may have above one per pixel of the limits; a JPEG has about half."""
 _SCAN, _MOST_SCANS = b"\xff\xda", 100
-"""A progressive JPEG has about ten; each goes over all pixels again."""
+"""A progressive JPEG has about ten scans; each goes over all pixels again."""
 _PNG, _MOST_CHUNKS = b"\x89PNG\r\n\x1a\n", 100_000
-"""Pillow takes 5 µs a chunk, even of no bytes; FFmpeg writes chunks of 4 KiB."""
+"""Pillow takes 5 µs per chunk, even for an empty one; FFmpeg writes chunks of 4 KiB."""
 _CODECS = ("av1", "h264", "hevc", "mjpeg", "mpeg4", "vp8", "vp9")
 _AV1_DECODERS = frozenset({"libdav1d", "libaom-av1", "libgav1"})
 _CONTAINERS = {"format_whitelist": "mov,mp4,matroska,webm,avi", "protocol_whitelist": "file"}
-"""No playlist, and nothing that opens another file."""
+"""No playlists, and no format that opens other files."""
 
-Image.MAX_IMAGE_PIXELS = None  # The limits of a source are held against the header instead.
+Image.MAX_IMAGE_PIXELS = None  # The header is compared with the source's limits instead.
 
 
 class Grouped(Document):
@@ -58,19 +58,19 @@ class Grouped(Document):
 
     @property
     def group_name(self) -> str | None:
-        """The episode's group; None where it names none."""
+        """The episode's group as text; None where it names none."""
         return None if self.group in (None, "") else str(self.group)
 
 
 def check_unpacked(where: Path | str, unpacked: int, packed: int, limits: MediaLimits) -> None:
-    """Refuse an array or a table by its bytes, unpacked and in the file, before it is read."""
+    """Refuse an array or table with too many unpacked bytes, or too high a ratio, before a read."""
     ratio = max(_ALWAYS_TAKEN, int(limits.ratio * packed))
     for most, name in ((limits.array_bytes, "array_bytes"), (ratio, "ratio")):
         check_limit(where, unpacked, most, name, "bytes unpacked")
 
 
 def check_image_file(file: Path, limits: MediaLimits) -> int:
-    """The bytes of a regular file, refused where no image within the limits needs as many."""
+    """The size of a regular file; refused if no image within the limits needs so many bytes."""
     size = RECORDINGS.check_file(file)
     check_limit(file, size, _IMAGE_BYTES + limits.pixels, "pixels", "bytes")
     return size
@@ -80,9 +80,9 @@ def check_image_file(file: Path, limits: MediaLimits) -> int:
 def opened_image(
     file: Path | bytes, where: str, limits: MediaLimits
 ) -> Generator[Image.Image, None, None]:
-    """An open JPEG or PNG; what goes wrong inside is a `RecordingError` that begins with `where`.
+    """An open JPEG or PNG; an error inside becomes a `RecordingError` that begins with `where`.
 
-    Its pixels are within the limits, by its header: nothing is decoded yet.
+    Its header says that its pixels are within the limits; nothing is decoded yet.
     """
     if isinstance(file, Path):
         check_image_file(file, limits)
@@ -111,11 +111,11 @@ def opened_image(
 
 
 def in_rgb(image: Image.Image) -> NDArray[np.uint8]:
-    """(height, width, 3), RGB, of an image of `opened_image`."""
+    """The pixels (height, width, 3), RGB, of an image of `opened_image`."""
     if image.mode in _SIXTEEN_BITS:
         upper = (np.asarray(image) >> 8).astype(np.uint8)
         return np.repeat(upper[:, :, None], 3, axis=2)
-    image.info.pop("transparency", None)  # Pillow would warn of that of a palette
+    image.info.pop("transparency", None)  # Pillow would warn about a palette's transparency
     return np.asarray(image.convert("RGB"))
 
 
@@ -123,9 +123,9 @@ def in_rgb(image: Image.Image) -> NDArray[np.uint8]:
 def opened_video(
     path: Path, limits: MediaLimits
 ) -> Generator[tuple[InputContainer, VideoStream], None, None]:
-    """An open video and its first stream; what goes wrong inside is a `RecordingError`.
+    """An open video and its first stream; an error inside becomes a `RecordingError`.
 
-    Its frames are within the limits, by its header and wherever one is decoded.
+    The header and the decoder both keep the frames within the limits.
     """
     RECORDINGS.check_file(path)
     unreadable = "cannot be read as video (MP4, Matroska, WebM or AVI)"
@@ -161,7 +161,7 @@ def check_limit(where: Path | str, count: int, most: int, name: str, what: str) 
 
 
 def _chunks(stream: IO[bytes]) -> int:
-    """Chunks of a PNG, no more than one too many; 0 of another file. Ends at the beginning."""
+    """Chunks of a PNG, counted up to one more than allowed; 0 for another file. Rewinds it."""
     count = 0
     if stream.read(len(_PNG)) == _PNG:
         while count <= _MOST_CHUNKS and len(head := stream.read(8)) == 8:
@@ -172,12 +172,12 @@ def _chunks(stream: IO[bytes]) -> int:
 
 
 def _scans(image: Image.Image, stream: IO[bytes]) -> int:
-    """Scans over a JPEG; its file is read for them only where it has several."""
+    """Scans of a JPEG; the whole file is read only if it may have several."""
     if image.format == "PNG":
         return 0
-    first = 8 + 2 * getattr(image, "layers", 0)  # the bytes of a scan's head that names them all
+    first = 8 + 2 * getattr(image, "layers", 0)  # bytes of the header of a scan of all components
     stream.seek(max(0, stream.tell() - first))
     if "progressive" not in image.info and stream.read(first).rfind(_SCAN) == 0:
-        return 1  # the decoder takes no other after it
+        return 1  # the decoder ignores later ones
     stream.seek(0)
     return stream.read().count(_SCAN)

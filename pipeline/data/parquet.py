@@ -1,4 +1,4 @@
-"""Parquet files, read only where the sizes that they declare are within limits."""
+"""Reads parquet files whose declared sizes are within limits."""
 
 from collections.abc import Generator, Iterator, Sequence
 from contextlib import contextmanager
@@ -16,14 +16,14 @@ from pipeline.base.config import MediaLimits
 from pipeline.data.media import INTACT, RECORDINGS, check_unpacked
 
 _WIDEST = 8
-"""Bytes of one number, or of what tells where a text begins."""
+"""Most bytes of one number, or of the offset of a text."""
 _BATCH_BYTES = 64 * 2**20
 _BATCH_ROWS = 1024
 
 
 @dataclass(frozen=True)
 class ParquetTable:
-    """A parquet file; its methods raise `RecordingError` that names it for all that is wrong."""
+    """A parquet file; its methods raise `RecordingError`, which names it, for every fault."""
 
     path: Path
     limits: MediaLimits
@@ -39,16 +39,16 @@ class ParquetTable:
     def check(
         self, file: pq.ParquetFile, wanted: Sequence[str], groups: Sequence[int]
     ) -> tuple[list[str], int]:
-        """The wanted columns that the file has, and the most bytes that a cell can have.
+        """Those wanted columns that the file has, and the most bytes that a cell can have.
 
-        Refuses a column that stands twice, and more bytes in these row groups than the limits
-        allow; nothing is read.
+        Refuses a repeated column, and more bytes in these row groups than the limits allow; reads
+        no data.
         """
         names = file.schema_arrow.names
         there = [name for name in wanted if name in names]
         if twice := [name for name in there if names.count(name) > 1]:
             raise INTACT.refusal(self.path, f"expected one column {twice[0]!r}, found more")
-        # Arrow reads all leaves whose path begins so.
+        # Arrow reads all leaves whose path begins with the column's name.
         begins = tuple(f"{name}." for name in there)
         schema = file.schema
         paths = [schema.column(place).path for place in range(len(schema))]
@@ -62,10 +62,10 @@ class ParquetTable:
         return there, pages
 
     def rows(self, wanted: Sequence[str]) -> Iterator[tuple[str, dict[str, Any]]]:
-        """The place of each row for messages, and its cells in the wanted columns that exist."""
+        """The place of each row (for messages) and its cells in those wanted columns that exist."""
         with self.open() as file:
             there, largest = self.check(file, wanted, range(file.num_row_groups))
-            # A text that is stored once can stand in every row.
+            # A text stored once may be in every row.
             rows = min(_BATCH_ROWS, _BATCH_BYTES // max(1, largest) + 1)
             number = 0
             for batch in file.iter_batches(rows, columns=there, use_threads=False):
@@ -74,14 +74,14 @@ class ParquetTable:
                     number += 1
 
     def numbers(self, wanted: Sequence[str], groups: Sequence[int] | None = None) -> pa.Table:
-        """The wanted columns that the file has, of numbers or lists of them.
+        """Those wanted columns that the file has, with numbers or lists of numbers.
 
-        They are of these row groups; of all where it is None.
+        Reads these row groups; all of them where `groups` is None.
         """
         return _numbers(self, self._stamp(), tuple(wanted), groups and tuple(groups))
 
     def groups(self, start: int, stop: int) -> tuple[range, int]:
-        """The row groups that hold these rows, and the row at which the first of them begins."""
+        """The row groups that hold these rows, and the first row of the first group."""
         counts = _row_counts(self, self._stamp())
         if sum(counts) < stop or min(counts) < 0:
             why = f"expected {stop} rows, found {sum(counts)} in its row groups"
@@ -92,7 +92,7 @@ class ParquetTable:
         return range(first, last + 1), int(ends[first] - counts[first])
 
     def _stamp(self) -> int:
-        """A number that changes when the file does."""
+        """A number that changes with the file."""
         RECORDINGS.check_file(self.path)
         return self.path.stat().st_mtime_ns
 
@@ -104,7 +104,7 @@ def _row_counts(table: ParquetTable, stamp: int) -> list[int]:
         return [file.metadata.row_group(place).num_rows for place in range(file.num_row_groups)]
 
 
-# Episodes are read in order, and hundreds of them can share a file or even a row group.
+# Cached, because hundreds of episodes, read in order, can share a file or even a row group.
 @lru_cache(maxsize=4)
 def _numbers(
     table: ParquetTable, stamp: int, wanted: tuple[str, ...], groups: tuple[int, ...] | None

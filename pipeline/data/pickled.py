@@ -1,6 +1,6 @@
-"""The recorder's old format: everything but the frames in a pickle, and no clock.
+"""The recorder's old format: a pickle with everything but the frames, and no clock.
 
-Row k of actions and sensor is at t0 + k / action_hz, t0 the earliest time in a frame's name.
+Row k of actions and sensor is at t0 + k / action_hz; t0 is the earliest time in a frame's name.
 """
 
 import os
@@ -91,7 +91,7 @@ class PickledRecording(InsertionRecording):
         self._pickle = path / MARKER
         self._kept: _Content | None = None
         self._located: dict[str, str] = {}
-        """By folder as recorded, the folder in which a frame of it lies."""
+        """Recorded folder -> the folder in which its frames are now."""
 
     def action(self) -> RecordedAction:
         content = self._content()
@@ -125,17 +125,17 @@ class PickledRecording(InsertionRecording):
         return read_robot_states(path, self._overrides.limits, self._start, rate_hz)
 
     def nominal(self) -> Nominal:
-        """The streams that the pickle's metadata count; its rates are those of the clocks made."""
+        """The streams that the pickle's metadata list; the clocks are made from its rates."""
         metadata = self._content().metadata
         told = promised(metadata, sensor=("has_sensor",), state=("num_robot_states",))
         return Nominal(streams=told, where=f"{MARKER}'s metadata")
 
     def _content(self) -> _Content:
-        """What the pickle holds, perhaps without the sensor's readings."""
+        """The pickle's content, possibly without the sensor's readings."""
         return self._kept or self._read()
 
     def _read(self) -> _Content:
-        # Thousands of episodes stay open: the sensor's readings are not kept, the rest is small.
+        # Thousands of episodes stay open, so the large sensor readings are not kept.
         loaded = load_plain(self._pickle, self._overrides.limits.array_bytes)
         content = RECORDINGS.parse(loaded, _Content, self._pickle)
         self._kept = content.model_copy(update={"sensor_data": None})
@@ -168,20 +168,20 @@ class PickledRecording(InsertionRecording):
 
     @cached_property
     def _recorded(self) -> Mapping[str, list[str]]:
-        """Paths as recorded, by view name; a view with an empty list never came up."""
+        """Recorded paths by view name; a view with an empty list was never captured."""
         recorded = self._content().image or {}
         return name_views({split_eye(view): paths for view, paths in recorded.items() if paths})
 
     def _locate(self, recorded: str, where: str) -> Path:
-        """The file as recorded, else the longest tail of its path under this folder."""
+        """The file at its recorded path, or at the longest tail of it under this folder."""
         at = max(recorded.rfind("/"), recorded.rfind("\\")) + 1
         known = self._located.get(recorded[:at])
         if known is not None and os.path.isfile(place := f"{known}/{recorded[at:]}"):  # noqa: PTH113
             return Path(place)
-        # A few parts of it at most still stand under the episode's folder.
+        # Only the last parts of the path can exist under the episode's folder.
         parts = _pure(recorded).parts[-10:]
         for tail in (Path(recorded), *(Path(*parts[first:]) for first in range(len(parts)))):
-            candidate = self.path / tail  # the tail alone, where it is absolute
+            candidate = self.path / tail  # the tail itself if it is absolute
             inside = tail.is_absolute() or ".." not in tail.parts
             if inside and os.path.isfile(candidate):  # noqa: PTH113, a name may be too long
                 self._located[recorded[:at]] = str(candidate.parent)

@@ -1,8 +1,8 @@
-"""Reading pickles that hold numpy arrays and plain containers, and nothing else.
+"""Reads pickles that hold only numpy arrays and plain containers.
 
-A pickle names functions and classes and has them called. Here only the names that arrays, numpy's
-scalars, bytes and sets are written with are known, and each stands for a function of this module
-that checks its arguments. Any other name is refused before it is looked up.
+A pickle names functions and classes, and the unpickler calls them. This module knows only the names
+needed for arrays, numpy scalars, bytes and sets, and replaces each with a function of its own that
+checks its arguments. Any other name is refused before it is looked up.
 """
 
 import pickle
@@ -21,11 +21,11 @@ _DTYPE = re.compile(r"[<>=|]?(\?|[biuf][1248]|[SU]\d{1,6})")
 
 
 class _Refused(Exception):
-    """The pickle asks for something that is not admitted; other errors are damage."""
+    """The pickle asks for something that is not allowed; other errors mean damage."""
 
 
 class _Dtype:
-    """Stands for `numpy.dtype`, whose own state could make pointers of numbers."""
+    """Replaces `numpy.dtype`, whose own state could turn numbers into pointers."""
 
     def __init__(self, code: Any, *_: Any) -> None:
         if not isinstance(code, str) or not _DTYPE.fullmatch(code):
@@ -37,7 +37,7 @@ class _Dtype:
 
 
 class _Array(np.ndarray):
-    """An array whose state comes after it, as protocols below 5 write it."""
+    """An array whose state follows it in the pickle, as in protocols below 5."""
 
     def __setstate__(self, state: Any, /) -> None:
         _, shape, dtype, fortran, data = state
@@ -49,7 +49,7 @@ def _reconstruct(*_: Any) -> _Array:
 
 
 def _frombuffer(data: Any, dtype: _Dtype, shape: Any, order: str, axes: Any = None) -> Any:
-    if not isinstance(data, bytes | bytearray):  # of an array, its memory could be given away
+    if not isinstance(data, bytes | bytearray):  # an array would share its memory
         raise _Refused("an array that shares the memory of another")
     flat = np.frombuffer(data, dtype.dtype)
     array = flat.reshape(shape, order="F" if order == "F" else "C")
@@ -61,7 +61,7 @@ def _scalar(dtype: _Dtype, data: bytes) -> Any:
 
 
 def _latin1(text: str, encoding: str) -> bytes:
-    """How protocol 2 writes bytes."""
+    """Bytes as protocol 2 writes them."""
     if encoding != "latin1":
         raise _Refused(f"encoding {shown(encoding)}")
     return text.encode("latin1")
@@ -78,29 +78,29 @@ _CALLS: dict[str, Callable[..., Any]] = {
     "builtins.frozenset": frozenset,
     "builtins.bytes": lambda: b"",
 }
-"""What the names in a pickle stand for."""
+"""The functions that replace the names in a pickle."""
 _SHARED = 100_000
-"""Values that may stand in lists named more than once."""
+"""How many values may repeat because a list is named more than once."""
 _PLAIN = (str, bytes, bytearray, int, float, type(None), np.ndarray)
 
 
 class _Unpickler(pickle.Unpickler):
     def find_class(self, module: str, name: str, /) -> Any:
-        # As numpy 2 and protocol 3 spell them.
+        # The spelling of numpy 2 and protocol 3.
         known = f"{module}.{name}".replace("numpy.core.", "numpy._core.")
         known = known.replace("__builtin__.", "builtins.")
         if known == "numpy.ndarray":  # an argument of _reconstruct, never called
             return None
         if known not in _CALLS:
             raise _Refused(shown(known).strip("'"))
-        # A pickle can set attributes of what it names: those of this object end with the reading.
+        # A pickle can set attributes of a named object, so it gets a new one each time.
         return partial(_CALLS[known])
 
 
 def _plain(value: Any, left: Iterator[int]) -> Any:
-    """The value with its arrays as numpy's own; refuses what is no data, and when none is `left`.
+    """The value with plain numpy arrays; refuses other objects, and more values than `left` has.
 
-    A list counts each time that it is named: a few bytes can name one a million times.
+    A list counts each time it is named, because a few bytes can name it a million times.
     """
     if next(left, None) is None:
         raise _Refused("the same lists again and again")
@@ -116,10 +116,10 @@ def _plain(value: Any, left: Iterator[int]) -> Any:
 
 
 def load_plain(path: Path, most: int) -> Any:
-    """What the pickle holds, if it is numpy arrays, scalars, dicts, lists, tuples, sets and text.
+    """The content of a pickle of numpy arrays, scalars, dicts, lists, tuples, sets and text.
 
-    Scalars of numpy become plain numbers. Raises `RecordingError` naming what else it asks for, of
-    which nothing is executed, or how it is damaged, or that the file has more than `most` bytes.
+    Numpy scalars become plain numbers. Raises `RecordingError`, and executes nothing, where the
+    pickle asks for anything else, is damaged, or has more than `most` bytes.
     """
     size = RECORDINGS.check_file(path)
     check_limit(path, size, most, "array_bytes", "bytes")
@@ -127,7 +127,7 @@ def load_plain(path: Path, most: int) -> Any:
     with RECORDINGS.foreign(path, "damaged pickle"), path.open("rb") as file:
         try:
             loaded = _Unpickler(file, encoding="latin1").load()
-            return _plain(loaded, iter(range(size + _SHARED)))  # a value takes a byte or more
+            return _plain(loaded, iter(range(size + _SHARED)))  # a value takes at least one byte
         except _Refused as error:
             raise INTACT.refusal(
                 path,

@@ -19,7 +19,7 @@ from pipeline.data.recording import Stream, checked_stream
 _STATE_FILES = "robot_state_*.csv"
 _SENSOR_FILES = "sensor_data_*.npz"
 _METADATA = "metadata.json"
-"""A file of which only `group` is read."""
+"""Only `group` is read from this file."""
 MARKER = f"{_STATE_FILES} and {_SENSOR_FILES}"
 
 

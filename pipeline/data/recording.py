@@ -1,10 +1,10 @@
 """A recording of any format on disk.
 
-A `Recording` is one episode. Making one touches metadata only; `state()`, `sensor()`, `poses()`
-and `action()` read a whole numeric stream; `cameras()` lists clocks and leaves the pixels on disk
-until `CameraStream.read` decodes them one frame at a time.
+A `Recording` is one episode. To make one reads only metadata; `state()`, `sensor()`, `poses()` and
+`action()` each read a complete numeric stream; `cameras()` lists clocks and leaves the pixels on
+disk until `CameraStream.read` decodes them one frame at a time.
 
-Times are float64 seconds on the recording's own clock, never decreasing. Anything wrong raises
+Times are float64 seconds on the recording's own clock and never decrease. Every fault raises
 `RecordingError` with the file and the place in it.
 """
 
@@ -29,7 +29,7 @@ from pipeline.base.source import CLOCK_SLACK_S
 from pipeline.data.media import FARTHEST_S, RECORDINGS
 
 _MOST_BYTES = 2**38
-"""Largest size of a file of an episode; a larger one is refused unread."""
+"""Largest allowed size of an episode's file; a larger one is refused unread."""
 ActionKind = Literal["absolute", "velocity", "delta"]
 
 
@@ -54,8 +54,8 @@ class Stream:
 class RecordedAction(Stream):
     """Actions that the recorder wrote.
 
-    `kind` decides whether they may be resampled (`delta` may not); `rate_hz` is the nominal rate
-    where the recording names one.
+    `kind` decides whether they may be resampled (`delta` may not); `rate_hz` is the nominal rate,
+    if the recording names one.
     """
 
     kind: ActionKind
@@ -64,36 +64,36 @@ class RecordedAction(Stream):
 
 @dataclass(frozen=True)
 class Nominal:
-    """What a recording's metadata promise, and where they are wrong; empty where neither."""
+    """Streams that a recording's metadata announce, and mistakes in the metadata."""
 
     streams: Mapping[str, str] = field(default_factory=dict[str, str])
-    """By stream, the entry that says that it was recorded: `state`: `robot_states_count 300`."""
+    """Stream -> the entry which says that it was recorded, such as `robot_states_count 300`."""
     where: str = ""
     """The metadata's file."""
     mistakes: tuple[str, ...] = ()
-    """Wrong entries that did not keep the episode from being read, each with its mend."""
+    """Wrong entries with which the episode could still be read, each with how to correct it."""
 
 
 class CameraStream(ABC):
-    """One view of one episode: `time` (frame,) float64 s is when each frame was captured."""
+    """One view of one episode; `time` (frame,) float64 s has the capture time of each frame."""
 
     view: str
     time: NDArray[np.float64]
 
     @property
     def covered(self) -> NDArray[np.float64]:
-        """(entry,) s, a clock from whose first to whose last entry the view shows a frame.
+        """(entry,) s, a clock: the view shows a frame from its first to its last entry.
 
-        It is `time`, unless a frame stands in several rows: then it is the rows' clock.
+        It is `time`, unless a frame is in several rows: then it is the rows' clock.
         """
         return self.time
 
     @abstractmethod
     def check(self, indices: Sequence[int]) -> NDArray[np.uint8] | None:
-        """Raise `RecordingError` naming the first of these frames that cannot be decoded.
+        """Raise `RecordingError`, which names the first of these frames that cannot be decoded.
 
-        Cheaper than `read`; called before anything expensive runs. Returns thumbnails (index,
-        height, width, 3), RGB, of one small size, where the check decodes frames, else None.
+        It is cheaper than `read` and runs before anything expensive. Returns thumbnails (index,
+        height, width, 3), RGB, all of the same small size, if the check decodes frames, else None.
         """
 
     @abstractmethod
@@ -104,38 +104,38 @@ class CameraStream(ABC):
         """
 
     def repeats(self) -> NDArray[np.bool_] | None:
-        """(frame - 1,) whether a frame is the one before; None where only decoding tells."""
+        """(frame - 1,) whether a frame equals the one before; None if that needs decoding."""
         return None
 
 
 class Recording(ABC):
-    """One episode on disk, with what the params say about its source."""
+    """One episode on disk, with the params of its source."""
 
     format: str
     id: str
-    """Unique within its source: the episode folder relative to its source, or `episode_000003`."""
+    """Unique within its source: the folder's name, with parents if needed, or `episode_000003`."""
     source: str
     path: Path
 
     def __init__(self, path: Path, source: Source, views: Sequence[str] | None) -> None:
-        """Only the views in `views` are kept; all of them where it is None."""
+        """Only the views in `views` are kept; all where `views` is None."""
         self.path = path
         self.id = path.name
         self.source = source.name
         self._overrides = source
         self._views = None if views is None else frozenset(views)
 
-    # Read on first use: the old format keeps it in the pickle, which opening leaves closed.
+    # Read on first use, because the old format has it in the pickle, which is not read on opening.
     @cached_property
     def instruction(self) -> str:
-        """The source's instruction, else the recording's own."""
+        """The source's instruction, or else the recording's own."""
         if self._overrides.instruction is not None:
             return self._overrides.instruction
         return self._recorded_instruction()
 
     @abstractmethod
     def files(self) -> list[Path]:
-        """Every file whose bytes decide what this episode says, sorted."""
+        """Every file whose bytes decide the episode's content, sorted."""
 
     @abstractmethod
     def all_views(self) -> Sequence[str]:
@@ -146,13 +146,13 @@ class Recording(ABC):
 
     @abstractmethod
     def _cameras(self) -> Mapping[str, CameraStream]:
-        """The views that have at least one frame; those that the filter leaves out may be there."""
+        """The views that have at least one frame; may include views that the filter drops."""
 
     def _wants(self, view: str) -> bool:
         return self._views is None or view in self._views
 
     def identity(self) -> str:
-        """Text that tells this episode from others in the same files; often ''."""
+        """Text that distinguishes this episode from others in the same files; often ''."""
         return ""
 
     def cameras(self) -> Mapping[str, CameraStream]:
@@ -165,22 +165,22 @@ class Recording(ABC):
 
     @property
     def group(self) -> str | None:
-        """The group that the recording names, such as an object or a day; None where it names none.
+        """The recording's group, such as an object or a day; None where it names none.
 
         Training holds out whole groups.
         """
         return None
 
     def empty_views(self) -> Sequence[str]:
-        """Views that have a place in the recording and no frame there."""
+        """Views that have a folder in the recording but no frame."""
         return []
 
     def depth_views(self) -> Sequence[str]:
-        """Cameras with depth maps, which are no views: the model does not see them."""
+        """Cameras with depth maps; they are not views, and the model does not see them."""
         return []
 
     def nominal(self) -> Nominal:
-        """What the recording's metadata promise, and where they are wrong."""
+        """Streams that the recording's metadata announce, and mistakes in the metadata."""
         return Nominal()
 
     def state(self) -> Stream | None:
@@ -197,11 +197,11 @@ class Recording(ABC):
         return False
 
     def poses(self) -> Stream | None:
-        """Tool poses x y z (mm) a b r (deg, mobile XYZ), or None; source of derived actions."""
+        """Tool poses x y z (mm) a b r (deg, mobile XYZ) to derive actions from, or None."""
         return None
 
     def action(self) -> RecordedAction | None:
-        """Recorded actions, or None where they have to be derived from `poses()`."""
+        """Recorded actions, or None where they must be derived from `poses()`."""
         return None
 
 
@@ -210,12 +210,12 @@ def checked_stream(
 ) -> Stream:
     """A checked `Stream`; `stored` is its clock as in the file.
 
-    Raises `RecordingError` (beginning with `where`) on differing lengths, a width other than the
-    channels', an empty stream, NaN or inf (row and channel named), a clock that goes backwards and
-    one that is too coarse.
+    Raises `RecordingError`, which begins with `where`, on different lengths, a width other than the
+    channels', an empty stream, NaN or inf (it names row and channel), and a clock that goes
+    backwards or is too coarse.
     """
     time = np.asarray(stored, np.float64)
-    with np.errstate(over="ignore"):  # what float32 cannot hold becomes inf, which is refused
+    with np.errstate(over="ignore"):  # too large for float32 becomes inf, which is refused
         values = np.asarray(values, np.float32)
     if values.ndim != 2 or values.shape[1] != len(channels.names):
         raise RecordingError(
@@ -241,8 +241,8 @@ def checked_stream(
 
 
 def check_clock(time: NDArray[np.float64], where: str, rising: bool = False) -> None:
-    """Raise `RecordingError` where a clock is not finite, farther from zero than any clock, or goes
-    backwards; where it has to be `rising`, also where it stands still."""
+    """Raise `RecordingError` where a clock is not finite, farther from zero than `FARTHEST_S`, or
+    goes backwards; with `rising`, also where it stands still."""
     far = np.flatnonzero(~(np.abs(time) <= FARTHEST_S))
     if far.size:
         raise RECORDINGS.refusal(
@@ -260,9 +260,9 @@ def check_clock(time: NDArray[np.float64], where: str, rising: bool = False) -> 
 
 
 def check_resolution(stored: NDArray[Any], where: str) -> None:
-    """Raise `RecordingError` where a clock, of the type in its file, is too coarse for its rate.
+    """Raise `RecordingError` where a clock, in the type of its file, is too coarse for its rate.
 
-    It is too coarse where more than two entries on average share a step of the type, or of the
+    It is too coarse if on average more than two entries share one step of the type, or of the
     decimals to which all times are rounded.
     """
     time = stored.astype(np.float64)
@@ -278,12 +278,12 @@ def check_resolution(stored: NDArray[Any], where: str) -> None:
 
 
 def content_digest(recording: Recording, digest_of: Callable[[Path], str]) -> str:
-    """Digest of a recording's files, wherever they lie; equal content means equal streams.
+    """Digest of a recording's files, in any folder; equal content means equal streams.
 
     `digest_of` returns the digest of one file. Raises `RecordingError`, and what `digest_of` raises
     where a file cannot be read.
     """
-    # Frame times stand in file names, so a name is content too; where the folder lies is not.
+    # Frame times are in file names, so a name is content too; the folder's path is not.
     named: list[tuple[str, str]] = []
     inside = f"{recording.path}/"
     for file in recording.files():
@@ -307,6 +307,6 @@ def absolute(path: Path) -> Path:
 
 
 def natural_key(text: str | Path) -> list[tuple[int, int, str]]:
-    """Sorts `View2` before `View10`."""
+    """A sort key that puts `View2` before `View10`."""
     parts = re.split(r"(\d+)", str(text))
     return [(0, int(part), part) if part.isdecimal() else (1, 0, part) for part in parts]

@@ -13,16 +13,16 @@ from pipeline.data.recording import CameraStream, Recording
 from pipeline.data.timeline import last_at
 
 Frames = dict[str, NDArray[np.uint8]]
-"""By view: (height, width, 3) RGB."""
+"""View -> (height, width, 3) RGB."""
 
 
 @dataclass(frozen=True)
 class RowRange:
-    """Rows of one episode, ascending, and the number of each view's frame in each row."""
+    """Rows of one episode, ascending, and for each view the index of the frame of each row."""
 
     recording: Recording
     cameras: Mapping[str, CameraStream]
-    """Of the whole episode: listing its frames takes time."""
+    """The cameras of the whole episode, shared because it takes time to list frames."""
     rows: NDArray[np.int64]
     """Store-global VL rows."""
     frames: Mapping[str, NDArray[np.int64]]
@@ -36,9 +36,9 @@ class RowRange:
         frame_time: NDArray[np.float64],
         views: Sequence[str],
     ) -> Self:
-        """The frames of rows with these capture times (row, view), as a store holds them.
+        """The frames of rows with these capture times (row, view) s from a store.
 
-        Raises `RecordingError` where the recording has no frames of these times.
+        Raises `RecordingError` where the recording has no frames at these times.
         """
         frames: dict[str, NDArray[np.int64]] = {}
         for column, view in enumerate(views):
@@ -47,7 +47,7 @@ class RowRange:
                 continue
             clock = cameras[view].time if view in cameras else np.zeros(0)
             frames[view] = last_at(clock, times)
-            # A store holds the cameras' own times, so another time is of another frame.
+            # A store holds the cameras' own times, so a different time means another frame.
             if (frames[view] < 0).any() or not np.array_equal(clock[frames[view]], times):
                 raise RecordingError(
                     f"{recording.path}: {view} has no frames at the times that the store has"
@@ -87,7 +87,7 @@ class RowFrames:
     def ranges(self, rows: NDArray[np.int64], most: int | None = None) -> Iterator[RowRange]:
         """These rows, ascending, in ranges of one episode and at most `most` rows each.
 
-        Raises as `RowRange.of` and the recordings' `cameras` do.
+        Raises what `RowRange.of` and the recordings' `cameras` raise.
         """
         for episode, inside in by_episode(rows, self.vl_start):
             recording, cameras = self._recordings[episode], self._cameras(episode)

@@ -2,7 +2,7 @@
 
 All times are float64 seconds on the recording's own clock. Ticks begin when every stream of the
 episode has begun, and end when one ends. Everything that a tick sees is at or before it; only its
-action lies ahead. An entry that is stored later than a tick by at most `rounding` is at it.
+action lies ahead. An entry that is at most `rounding` later than a tick counts as at the tick.
 """
 
 from collections import defaultdict
@@ -21,10 +21,10 @@ ActionRotation = Literal["rotvec", "euler_delta"]
 
 FINEST_S, COARSEST_S = 1e-9, 1e-3
 """Bounds of `rounding`: sums of steps in float64 are off by more than their last digit, and a
-reading more than a millisecond after a tick is later than it, however it is stored."""
+reading more than a millisecond after a tick is always later than it."""
 
-_MOST_TICKS = 1_000_000  # of an episode: 28 hours at 10 Hz
-_SLOWEST_HZ = 0.66  # of an episode's fastest stream: 650 Hz in milliseconds looks like 0.65
+_MOST_TICKS = 1_000_000  # per episode: 28 hours at 10 Hz
+_SLOWEST_HZ = 0.66  # of an episode's fastest stream: 650 Hz in milliseconds looks like 0.65 Hz
 
 _TRANSLATION = ("dx", "dy", "dz")
 _ROTATION = {"rotvec": ("rx", "ry", "rz"), "euler_delta": ("da", "db", "dr")}
@@ -43,26 +43,26 @@ class Timeline:
     action_channels: Channels
     action_kind: str
     recorded_hz: float | None
-    """Rate of the recorded actions; None of a single one, and of those derived from poses."""
+    """Rate of the recorded actions; None for a single action or actions derived from poses."""
     fastest_hz: float
     """Rate of the episode's fastest stream."""
     vl_row: NDArray[np.int64]
-    """(tick,) the VL row that serves it."""
+    """(tick,) the VL row that each tick uses."""
     vl_time: NDArray[np.float64]
     """(vl_row,) s, the tick each VL row is computed for."""
     frames: Mapping[str, NDArray[np.int64]]
-    """By view: (vl_row,) the last frame at or before `vl_time`."""
+    """View -> (vl_row,) the last frame at or before `vl_time`."""
     frame_time: Mapping[str, NDArray[np.float64]]
-    """By view: (vl_row,) s."""
+    """View -> (vl_row,) s, the capture time of that frame."""
     sensor_end: NDArray[np.int64]
     """(tick,) one past the last sensor reading at or before the tick; 0 without a sensor."""
     state_end: NDArray[np.int64]
     """(tick,) one past the last state at or before the tick; 0 without a state."""
     slack_s: float
-    """Most seconds by which an entry of a clock may be later than a tick and still be at it."""
+    """Most seconds that an entry of a clock may be later than a tick and still count as at it."""
 
     def frame_times(self, views: Sequence[str]) -> NDArray[np.float64]:
-        """(vl_row, view) s, NaN where the episode lacks the view."""
+        """Capture times (vl_row, view) s; NaN where the episode lacks the view."""
         missing = np.full(len(self.vl_time), np.nan)
         columns = [self.frame_time.get(view, missing) for view in views]
         return np.stack(columns, axis=1) if columns else np.zeros((len(self.vl_time), 0))
@@ -80,8 +80,8 @@ def build_timeline(
 
     `state` and `sensor` are the recording's own streams, which the caller has read. Raises
     `RecordingError` where there are no actions, no instant is covered by every stream, clocks are
-    not in seconds or contradict the metadata's rate, or delta actions would have to be resampled,
-    and `ConfigError` where actions are derived from poses and `action_hz` is None.
+    not in seconds or contradict the metadata's rate, or delta actions would need resampling, and
+    `ConfigError` where actions are derived from poses and `action_hz` is None.
     """
     cameras = recording.cameras()
     clocks = {f"view {view}": camera.covered for view, camera in cameras.items()}
@@ -125,7 +125,7 @@ def build_timeline(
 def choose_action_rotation(
     asked: Literal["auto", "rotvec", "euler_delta"], recordings: Sequence[Recording]
 ) -> ActionRotation:
-    """The convention asked for; `auto` is rotvec where every recording has poses, else Euler."""
+    """The requested convention; `auto` is rotvec if every recording has poses, else Euler."""
     if asked != "auto":
         return asked
     return "rotvec" if all(recording.has_poses for recording in recordings) else "euler_delta"
@@ -134,18 +134,18 @@ def choose_action_rotation(
 def last_at(
     clock: NDArray[np.float64], times: NDArray[np.float64], slack_s: float = 0.0
 ) -> NDArray[np.int64]:
-    """By time, the index of the last entry of a sorted clock at or before it; -1 for none.
+    """For each time, the index of the last entry of a sorted clock at or before it; -1 for none.
 
-    An entry up to `slack_s` later is at it.
+    An entry up to `slack_s` later counts as at the time.
     """
     return np.searchsorted(clock, times + slack_s, side="right") - 1
 
 
 def rounding(clock: NDArray[np.float64]) -> float:
-    """Seconds by which two times on a clock may differ and be the same time.
+    """Most seconds by which two times on a clock may differ and still be the same time.
 
-    Two steps of float32 where all entries are numbers of that type; else a nanosecond, which has no
-    effect on seconds since 1970.
+    Two steps of float32 if all entries are float32 numbers; else a nanosecond, which has no effect
+    on seconds since 1970.
     """
     narrow = clock.astype(np.float32)
     if not np.array_equal(clock, narrow):
@@ -156,9 +156,9 @@ def rounding(clock: NDArray[np.float64]) -> float:
 def rate_notes(
     rates: Iterable[tuple[str, float | None, float]], action_hz: float | None
 ) -> dict[str, str]:
-    """By source, what happens to actions whose ticks come at another rate than was recorded.
+    """For each source whose ticks have another rate than its actions, what happens to the actions.
 
-    `rates` are source, `recorded_hz` and `fastest_hz` of each episode's timeline.
+    `rates` has source, `recorded_hz` and `fastest_hz` of each episode's timeline.
     """
     if action_hz is None:
         return {}
@@ -183,14 +183,14 @@ def rate_notes(
 
 
 def tick_hz(recorded_hz: Iterable[float | None], action_hz: float | None) -> float | None:
-    """Ticks a second: `action_hz`, or the median rate of the recordings where it is None.
+    """Ticks per second: `action_hz`, or the median rate of the recordings where it is None.
 
-    `recorded_hz` is of each episode's timeline; None where none of them has a rate.
+    `recorded_hz` has the rate of each episode's timeline. Returns None where no episode has a rate.
     """
     rates = [hz for hz in recorded_hz if hz]
     if action_hz is not None or not rates:
         return action_hz
-    return float(f"{np.median(rates):.5g}")  # what a clock in float32 tells of a rate
+    return float(f"{np.median(rates):.5g}")  # the digits that a float32 clock can tell
 
 
 def wrapped_deg(angle: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -201,7 +201,7 @@ def wrapped_deg(angle: NDArray[np.float64]) -> NDArray[np.float64]:
 def _redo_rotation(
     recorded: RecordedAction, poses: Stream | None, action_rotation: ActionRotation
 ) -> bool:
-    """Whether recorded Euler deltas have to be derived anew, as rotation vectors, from poses."""
+    """Whether recorded Euler deltas must be derived again from poses, as rotation vectors."""
     return (
         action_rotation == "rotvec"
         and poses is not None
@@ -215,10 +215,10 @@ def _pose_channels(action_rotation: ActionRotation) -> Channels:
 
 
 def _recorded_hz(recording: Recording, recorded: RecordedAction) -> float | None:
-    """Rate of the recorded actions, on which metadata and clock agree; None of a single one."""
+    """Rate of the recorded actions, on which metadata and clock must agree; None for one action."""
     nominal, measured = recorded.rate_hz, _hz(recorded.time)
     if nominal and measured:
-        # Jitter moves the median of a short episode, a gap moves the mean: both have to differ.
+        # Jitter moves a short episode's median and a gap moves the mean, so both must differ.
         mean = (len(recorded.time) - 1) / float(recorded.time[-1] - recorded.time[0])
         if all(abs(nominal - hz) > RATE_TOLERANCE * nominal for hz in (measured, mean)):
             raise RecordingError(
@@ -286,14 +286,14 @@ def _pose_actions(
     pose = poses.values[first].astype(np.float64)
     place = np.stack([np.interp(edges, clock, pose[:, axis]) for axis in range(3)], axis=1)
     if action_rotation == "rotvec":
-        from scipy.spatial.transform import Rotation, Slerp  # slow to import, and seldom needed
+        from scipy.spatial.transform import Rotation, Slerp  # slow to import, rarely needed
 
         # R = Rx(a)·Ry(b)·Rz(r), the arm's mobile XYZ convention.
         turned = Slerp(clock, Rotation.from_euler("XYZ", pose[:, 3:], degrees=True))(edges)
         # In the base frame: R(k+1)·R(k)ᵀ.
         rotation = (turned[1:] * turned[:-1].inv()).as_rotvec(degrees=True)
     else:
-        # The recorder's own branch of the angles, made continuous; slerp might leave it.
+        # Keeps the recorder's own branch of the angles, made continuous; slerp might change it.
         angles = np.unwrap(pose[:, 3:], axis=0, period=360.0)
         at = np.stack([np.interp(edges, clock, angles[:, axis]) for axis in range(3)], axis=1)
         rotation = wrapped_deg(np.diff(at, axis=0))
@@ -302,7 +302,7 @@ def _pose_actions(
 
 
 def _covered(recording: Recording, clocks: _Clocks) -> tuple[float, float]:
-    """The first and last instant at which every stream has begun and none has ended."""
+    """The first and the last instant at which every stream has begun and none has ended."""
     late = max(clocks, key=lambda name: float(clocks[name][0]))
     early = min(clocks, key=lambda name: float(clocks[name][-1]))
     start, stop = float(clocks[late][0]), float(clocks[early][-1])
@@ -315,14 +315,14 @@ def _covered(recording: Recording, clocks: _Clocks) -> tuple[float, float]:
 
 
 def _slack(clocks: _Clocks) -> float:
-    """Most seconds by which an entry may lie after an instant and still be at it."""
+    """Most seconds that an entry may be after an instant and still count as at it."""
     return max(map(rounding, clocks.values()))
 
 
 def _grid(
     recording: Recording, clocks: _Clocks, start: float, stop: float, rate_hz: float
 ) -> NDArray[np.float64]:
-    """start, start + 1/rate, … up to `stop`, or to a microsecond or the clocks' slack beyond."""
+    """start, start + 1/rate, … up to `stop` plus a microsecond or the clocks' slack."""
     count = np.floor((stop - start) * rate_hz + max(1e-6, _slack(clocks)) * rate_hz) + 1
     fastest = max(map(_hz, clocks.values()))
     if count > _MOST_TICKS or 0 < fastest < _SLOWEST_HZ:
@@ -343,7 +343,7 @@ def _not_empty(recording: Recording, time: NDArray[np.float64]) -> NDArray[np.fl
 
 
 def _hz(clock: NDArray[np.float64]) -> float:
-    """Entries a second; 0 of a clock without two instants."""
+    """Entries per second; 0 for a clock without two different times."""
     steps = np.diff(clock)
     steps = steps[steps > 0]
     return 1.0 / float(np.median(steps)) if len(steps) else 0.0

@@ -1,7 +1,7 @@
 """Frames of a video file, by number, decoded one at a time.
 
 LeRobot pairs rows with frames by number. A frame's number is its rank by presentation time in its
-clip: the whole file, or the part of a shared file that holds one episode.
+clip. A clip is the whole file, or the part of a shared file that holds one episode.
 """
 
 import sys
@@ -30,25 +30,25 @@ _MOST_SEEKS = 1000
 
 @dataclass(frozen=True)
 class VideoSpan:
-    """An episode's frames of a file: all of them where `first` is None."""
+    """An episode's frames in a video file: all frames where `first` is None."""
 
     path: Path
     first: int | None = None
     count: int | None = None
-    """Their number by the metadata; None where it names none."""
+    """How many frames the metadata name; None where they do not say."""
 
 
 class _FrameTable(NamedTuple):
-    """The container's times of the frames of a clip, in order of presentation: (frame,) each."""
+    """Times of a clip's frames in the container's units, in presentation order: (frame,) each."""
 
     pts: NDArray[np.int64]
     key_pts: NDArray[np.int64]
-    """The key frame from which decoding has to start."""
+    """The key frame from which decoding must start."""
     key_dts: NDArray[np.int64]
 
 
 class VideoClip(CameraStream):
-    """A view whose frames are those of a video; `time` has one entry per row of the episode."""
+    """A view whose frames are in a video; `time` has one entry per row of the episode."""
 
     def __init__(
         self,
@@ -65,10 +65,10 @@ class VideoClip(CameraStream):
         self._limits = limits
 
     def check(self, indices: Sequence[int]) -> None:
-        """Reads every packet of the clip and decodes the frames asked for, one held at a time.
+        """Read every packet of the clip and decode these frames, with one in memory at a time.
 
         So it finds a missing, truncated or undecodable file, a frame count other than the rows',
-        and damage inside a packet wherever the decoder notices it.
+        and damage inside a packet if the decoder notices it.
         """
         for _ in self._frames(sorted(set(indices))):
             pass
@@ -81,7 +81,7 @@ class VideoClip(CameraStream):
             yield image
 
     def _frames(self, indices: Sequence[int]) -> Iterator[VideoFrame]:
-        """The frames before their conversion to RGB; the same object where an index repeats."""
+        """The frames before conversion to RGB; the same object where an index repeats."""
         table = self._table
         start = table.pts[0] if len(table.pts) else 0
         with opened_video(self._span.path, self._limits) as (container, stream):
@@ -90,7 +90,7 @@ class VideoClip(CameraStream):
             for index in indices:
                 assert index >= at, "frames are read in never decreasing order"
                 if frame is None or index != at:
-                    # Whole groups of pictures between two frames are skipped, not decoded.
+                    # Complete groups of pictures between two frames are skipped, not decoded.
                     if frame is None or table.key_pts[index] > table.pts[at + 1]:
                         # A new container stands at its first frame. A seek there may lead to a
                         # later key frame of the same time.
@@ -103,7 +103,7 @@ class VideoClip(CameraStream):
                 yield frame
 
     def _decode_until(self, decoded: Iterator[VideoFrame], index: int, twins: int) -> VideoFrame:
-        """The frame that follows `twins` others of the same time."""
+        """The frame that follows `twins` other frames of the same time."""
         pts, key_pts, reason = int(self._table.pts[index]), int(self._table.key_pts[index]), ""
         try:
             for frame in decoded:
@@ -112,7 +112,7 @@ class VideoClip(CameraStream):
                         return frame
                     twins -= 1
                     continue
-                # A damaged frame since the key frame spoils those that are predicted from it.
+                # A damaged frame after the key frame spoils the frames predicted from it.
                 spoilt = frame.is_corrupt and frame.pts is not None and frame.pts >= key_pts
                 if frame.pts is None or frame.pts >= pts or spoilt:
                     break
@@ -136,14 +136,14 @@ class VideoClip(CameraStream):
                     "the episode out"
                 )
         table = np.array(sorted(packets, key=itemgetter(0)), np.int64).reshape(-1, 3).T
-        # Frames of one time are counted from the first of them, so decoding starts before it.
+        # Frames of equal time are counted from the first of them, so decoding starts before it.
         first, stop = (np.searchsorted(table[0], table[0], side) for side in ("left", "right"))
         before = np.where(stop - first > 1, np.maximum(first - 1, 0), np.arange(rows))
         return _FrameTable(table[0], *table[1:, before])
 
 
 def frame_count(path: Path, limits: MediaLimits) -> int:
-    """How many frames a video says it has; 0 where it does not say it or cannot be read."""
+    """The number of frames in a video's header; 0 where it is missing or unreadable."""
     with suppress(RecordingError), opened_video(path, limits) as (_, stream):
         return stream.frames
     return 0
@@ -152,7 +152,7 @@ def frame_count(path: Path, limits: MediaLimits) -> int:
 def _packets(
     container: InputContainer, stream: VideoStream, span: VideoSpan, fps: float, rows: int
 ) -> Iterator[tuple[int, int, int]]:
-    """`pts`, `key_pts`, `key_dts` of the clip's frames, in decoding order; none is decoded."""
+    """`pts`, `key_pts`, `key_dts` of the clip's frames, in decoding order; decodes none."""
     if stream.time_base is None:
         raise RecordingError(f"{span.path}: the video has no time base")
     start, step = stream.start_time or 0, 1 / (fps * float(stream.time_base))
@@ -171,14 +171,14 @@ def _packets(
         if packet.is_keyframe:
             keys = [*keys[-1:], (packet.pts, dts)]
         if keys and round((packet.pts - start) / step) in wanted:
-            # A frame shown before the newest key frame depends on the key frame before that.
+            # A frame shown before the newest key frame depends on the previous key frame.
             yield (packet.pts, *(keys[-1] if packet.pts >= keys[-1][0] else keys[0]))
 
 
 def _seek_before(container: InputContainer, stream: VideoStream, pts: int) -> None:
-    """Go to a key frame that is shown at or before `pts`.
+    """Seek to a key frame that is shown at or before `pts`.
 
-    A seek goes by decoding times, so the key frame it finds may be shown later.
+    A seek uses decoding times, so the key frame that it finds may be shown later.
     """
     target = pts
     for _ in range(_MOST_SEEKS):

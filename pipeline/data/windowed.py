@@ -1,8 +1,8 @@
 """The recorder's new format: sensor windows, an optional robot clock, `metadata.json`.
 
-The recorder cuts windows at a fixed stride, and stamps each with the time of its last reading. They
-overlap, abut or have gaps; `rebuild` makes the stream from which they were cut. The recorder's
-clock jitters, so the stride is taken from the clock and then proved on the overlapping data.
+The recorder cuts windows at a fixed stride and stamps each with the time of its last reading.
+Windows overlap, abut or have gaps; `rebuild` restores the stream from which they were cut. The
+recorder's clock jitters, so the stride from the clock is checked against the overlapping data.
 """
 
 import os
@@ -34,13 +34,13 @@ from pipeline.data.recording import Nominal, Stream, check_clock, check_resoluti
 MARKER = "metadata.json"
 _SENSOR_FILE = "sensor_data.npz"
 _LEFT_WITHOUT = frozenset({_SENSOR_FILE, "robot_states.npz"})
-"""Files by which an episode that lost its metadata.json is reported, not passed over."""
+"""Files that mark a folder without metadata.json as a broken episode, which is reported."""
 _OVERLAP = 0.75
-"""Windows overlap for certain where the clock advances by less than this fraction of one."""
+"""Windows certainly overlap if the clock advances by less than this fraction of a window."""
 _PAIRS_ASKED = 16
 _SHIFTS_TRIED = 32
-"""Shifts that are compared, the nearest to the expected stride first: readings agree at one shift,
-or, where they stand still, at all."""
+"""Most shifts that are compared, the nearest to the expected stride first: readings agree at one
+shift or, if they are constant, at all shifts."""
 
 _Count = Annotated[int, Field(ge=0, le=10**9)]
 
@@ -157,10 +157,10 @@ def rebuild(
 ) -> tuple[NDArray[np.float64], Numbers]:
     """Clock (reading,) s and readings (reading, channel) without the duplicates.
 
-    `ends` (window,) never decreases; `windows` is (window, reading, channel). Readings are spread
+    `ends` (window,) s never decreases; `windows` is (window, reading, channel). Readings are spread
     evenly between the ends of windows that overlap or abut; after a gap, and in the first window,
     they are dated back from the end at `sensor_hz`. Raises `RecordingError` where windows overlap
-    by the clock and their readings differ, and on NaN or inf.
+    by the clock but their readings differ, and on NaN or inf.
     """
     _check_finite(windows, where)
     width = windows.shape[1]
@@ -181,7 +181,7 @@ def rebuild(
 def _strides(
     ends: NDArray[np.float64], windows: Numbers, sensor_hz: float | None, where: str
 ) -> list[int]:
-    """How many readings each window but the first adds to the one before."""
+    """How many new readings each window after the first has."""
     width = windows.shape[1]
     if len(ends) < 2:
         return []
@@ -189,7 +189,7 @@ def _strides(
     proved = _proved_stride(windows)
     if sensor_hz is not None:
         expected = steps * sensor_hz
-        # Where windows abut by the clock, a reading that the sensor repeats looks like an overlap.
+        # If windows abut by the clock, a reading that the sensor repeats looks like an overlap.
         shared = windows[1:, : width - proved] if proved else windows[1:, :0]
         abut = abs(np.median(expected) - width) <= 0.1 * width
         if not abut or (shared != shared[:, :1]).any():
@@ -220,9 +220,9 @@ def _strides(
 def _check_rate(
     steps: NDArray[np.float64], proved: int | None, sensor_hz: float, where: str
 ) -> None:
-    """Refuse a `sensor_hz` more than 10 % off what clock and overlap prove.
+    """Refuse a `sensor_hz` that differs by more than 10 % from clock and overlap.
 
-    Gaps spoil the mean step, stamps in bursts the median; one of them must agree.
+    Gaps change the mean step, and stamps in bursts the median; one of the two must agree.
     """
     usual, mean = float(np.median(steps)), float(steps.mean())
     if proved and all(abs(step * sensor_hz - proved) > 0.1 * proved for step in (usual, mean)):
@@ -242,7 +242,7 @@ def _check_finite(windows: Numbers, where: str) -> None:
 
 
 def _proved_stride(windows: Numbers) -> int | None:
-    """The stride at which most of some window pairs agree; None where the data does not tell."""
+    """The stride at which most of the sampled window pairs agree; None if they do not show one."""
     asked = np.unique(np.linspace(1, len(windows) - 1, _PAIRS_ASKED).astype(int))
     votes: Counter[int] = Counter()
     for index in asked:
@@ -256,7 +256,7 @@ def _proved_stride(windows: Numbers) -> int | None:
 
 
 def _first_rows(previous: Numbers, window: Numbers) -> Sequence[int]:
-    """Where in the previous window this window's first reading stands."""
+    """The rows of the previous window that equal this window's first reading."""
     same = np.flatnonzero(previous[:, 0] == window[0, 0])
     return [int(row) for row in same if np.array_equal(previous[row], window[0])]
 

@@ -1,8 +1,8 @@
 """The executor on dask workers: they write ranges of rows, this process marks what was written.
 
-Dask repeats tasks that failed or whose worker died. Those that it gives up are computed at the end,
-one episode at a time, so that no recording is blamed for another. Each worker process holds one
-model, with which its threads take turns: while one encodes, the others prepare.
+Dask repeats tasks that failed or whose worker died. The tasks that dask gives up run again at the
+end, one episode at a time, so that no recording is blamed for another. Each worker process holds
+one model, and its threads take turns with it: while one thread encodes, the others prepare.
 """
 
 import math
@@ -59,13 +59,13 @@ from pipeline.vlm.feature_spec import feature_spec
 
 PAGE_BYTES = 4096
 
-# Rows a task where each worker finds its own batch size.
+# Rows per task when each worker finds its own batch size.
 _AUTO_RANGE_ROWS = 32
 
-# Tasks that the scheduler holds: enough for hundreds of workers, never millions.
+# Most tasks in the scheduler at a time: enough for hundreds of workers, never millions.
 _TASKS_AHEAD = 1000
 
-# When so many workers have died before any row was written, no recording is to blame.
+# If this many workers die before any row is written, no recording is to blame.
 _HOPELESS_DEATHS = 4
 
 # Time for local processes to come back after a death, however long their imports take.
@@ -86,12 +86,12 @@ Result = Any
 def compute_rows(plugin: str, rows: Range) -> list[WrittenRows] | Exception:
     """The task: write the features of these rows.
 
-    Raises `RecordingError` or `NumericsError` where a recording cannot be computed, which dask
-    tries again. What fails for every other row as well (no model, a full disk) is returned.
+    Raises `RecordingError` or `NumericsError` where a recording cannot be computed; dask then tries
+    again. Returns an error that would stop every other row as well (no model, a full disk).
     """
-    held: ExtractionPlugin = get_worker().plugins[plugin]  # pyright: ignore[reportAssignmentType]
+    extraction: ExtractionPlugin = get_worker().plugins[plugin]  # pyright: ignore[reportAssignmentType]
     try:
-        return held.compute(rows)
+        return extraction.compute(rows)
     except (RecordingError, NumericsError):
         raise
     except Exception as error:
@@ -99,9 +99,9 @@ def compute_rows(plugin: str, rows: Range) -> list[WrittenRows] | Exception:
 
 
 class ExtractionPlugin(WorkerPlugin):
-    """A worker's part of an extraction; workers that join later get it, too.
+    """A worker's part of an extraction.
 
-    The coordinator makes it, and dask sends it to every worker.
+    The coordinator makes it, and dask sends it to every worker, also to workers that join later.
     """
 
     def __init__(self, surveyed: Survey, known: Sequence[Path]) -> None:
@@ -118,14 +118,14 @@ class ExtractionPlugin(WorkerPlugin):
         return isinstance(self.surveyed.params.extract.workers, int)
 
     def setup(self, worker: Worker) -> None:
-        """Prepare to begin with the first task; whatever fails then is that task's error."""
+        """Open nothing yet: the first task does, so that a failure there is that task's error."""
         self._number = worker.name
         self._engine: RowEngine | None = None
         self._closed = False
         self._opening, self._model_turn, self._disk_turn = (threading.Lock() for _ in range(3))
 
     def teardown(self, worker: Worker) -> None:
-        """Close the files, between two writes; a range that is still computed writes no more."""
+        """Close the files between two writes; a range that is still computed is not written."""
         with self._opening, self._disk_turn:
             self._closed = True
             if self._engine is not None:
@@ -133,7 +133,7 @@ class ExtractionPlugin(WorkerPlugin):
                 self._build.close()
 
     def compute(self, rows: Range) -> list[WrittenRows]:
-        """Write the features of these rows; equal ones among them are computed once."""
+        """Write the features of these rows; rows of equal key are computed once."""
         engine = self._opened()
         prepared = _prepared(engine, rows)
         blocks: list[FeatureBlock] = []
@@ -169,7 +169,7 @@ class ExtractionPlugin(WorkerPlugin):
     def device_of(self, worker_name: object) -> str:
         """The device of a worker: local ones take turns over the GPUs, others use their first.
 
-        As dask-cuda, and CUDA_VISIBLE_DEVICES, show each worker its own first.
+        dask-cuda and CUDA_VISIBLE_DEVICES show each of those workers its own GPU first.
         """
         wanted, devices = self.surveyed.params.extract.device, torch.cuda.device_count()
         turns = wanted in ("auto", "cuda") and devices > 1
@@ -208,17 +208,18 @@ def compute_on_cluster(
     missing: Range,
     marks: RowMarks,
 ) -> Speed:
-    """The executor of `extract.workers`; a speed where more rows came than the first ones.
+    """The executor of `extract.workers`; the speed counts the rows after the first result.
 
-    Raises at once what stops every row: `ConfigError` for a wrong address or a worker elsewhere,
-    `VLMError`, `DiskFull`, `PipelineError` where the scheduler or all workers are lost. Raises
-    `RecordingError` after all other rows where some could not be computed.
+    An error that stops every row is raised at once: `ConfigError` for a wrong address or a worker
+    that does not see the same files, `VLMError`, `DiskFull`, `PipelineError` where the scheduler or
+    all workers are lost. Raises `RecordingError` after all other rows where some could not be
+    computed.
     """
     extract, array = surveyed.params.extract, marks.build.specs[FEATURES]
     plugin = ExtractionPlugin(surveyed, [source.path for source in known])
     rows = _AUTO_RANGE_ROWS if extract.batch_size == "auto" else extract.batch_size
     most = max(1, rows // surveyed.spec.variants)
-    # Where hosts may differ, no two ranges share a page of the file.
+    # On several hosts, no two ranges may share a page of the file.
     together = 1 if plugin.local else rows_between_pages(array.row_bytes)
     ranges = ranges_of(missing, most, array.chunk_rows, together)
     begun, before = 0.0, 0
@@ -234,7 +235,7 @@ def compute_on_cluster(
 
 
 class ClusterTasks:
-    """Ranges on their way to workers and back."""
+    """Sends ranges to the workers and collects their results."""
 
     def __init__(
         self, client: Client, plugin: ExtractionPlugin, vl_start: NDArray[np.int64]
@@ -246,7 +247,7 @@ class ClusterTasks:
         self._any_written = False
 
     def results(self, ranges: Iterable[Range]) -> Generator[list[WrittenRows]]:
-        """What workers wrote; raises at the end what could not be computed."""
+        """The rows that workers wrote; raises one error at the end for those that failed."""
         given_up: list[Range] = []
         for done in self._completed(ranges, self._plugin.surveyed.params.extract.retries):
             written = [block for _, result in done if isinstance(result, list) for block in result]
@@ -275,7 +276,7 @@ class ClusterTasks:
     def _completed(
         self, ranges: Iterable[Range], retries: int
     ) -> Iterator[list[tuple[Range, Result]]]:
-        """Ranges and what came of them, as they are done."""
+        """Ranges with their results, in the order in which they finish."""
         left, under_way = iter(ranges), dict[Future[Any], Range]()
         submit = partial(self._client.submit, compute_rows, self._plugin.name, pure=False)
 
@@ -292,12 +293,12 @@ class ClusterTasks:
             for future, result in batch:
                 error = result[1] if isinstance(result, tuple) else result
                 done.append((under_way.pop(future), error))
-                future.release()  # else dask computes it again where the worker that has it dies
+                future.release()  # otherwise dask computes it again if its worker dies
             completed.update(submitted(len(batch)))
             yield done
 
     def _raise_unless_recording(self, error: Exception) -> None:
-        """Raise an error that no recording can be blamed for."""
+        """Raise the error unless a recording may have caused it."""
         if isinstance(error, CancelledError):
             raise PipelineError(
                 f"the connection to the dask scheduler was lost ({error}). What was written is "
@@ -320,7 +321,7 @@ class ClusterTasks:
             )
 
     def _reason(self, episode: int, rows: Range, error: Exception) -> str:
-        """Why the rows of an episode could not be computed even alone."""
+        """Why the rows of an episode could not be computed, even without other rows."""
         self._raise_unless_recording(error)
         if isinstance(error, KilledWorker):
             deaths = 1 + error.allowed_failures
@@ -404,8 +405,8 @@ def connected(extract: ExtractParams) -> Generator[Client]:
 def _local_cluster(workers: int, extract: ExtractParams) -> Generator[LocalCluster]:
     """Worker processes of this host; raises `PipelineError` where they cannot be started.
 
-    Interrupting dask while they start leaves noise and orphans. So a thread starts them, and an
-    interrupted coordinator kills the processes, upon which that thread ends by itself.
+    To interrupt dask while they start leaves error output and orphan processes. So a thread starts
+    them, and an interrupted coordinator kills the processes; that thread then ends by itself.
     """
     cores = len(os.sched_getaffinity(0))
     threads = os.environ.get("OMP_NUM_THREADS") or str(max(1, cores // workers))
@@ -416,8 +417,8 @@ def _local_cluster(workers: int, extract: ExtractParams) -> Generator[LocalClust
     others = set(active_children())
     with ThreadPoolExecutor(1) as pool:
         # Ctrl-C reaches the whole process group, but only the coordinator may act on it: threads
-        # and processes, also workers begun again later, inherit the mask of the one that made them.
-        resource_tracker.ensure_running()  # now, for it unblocks SIGINT in whoever starts it
+        # and processes, also workers that restart later, inherit the signal mask of their parent.
+        resource_tracker.ensure_running()  # now: it unblocks SIGINT in the calling thread
         before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
         starting = pool.submit(start)
         try:

@@ -1,4 +1,4 @@
-"""Prepared rows -> features, in batches of equal shape that are as large as is fastest."""
+"""Prepared rows -> features, in batches of equal shape and of the fastest size."""
 
 import sys
 from collections import defaultdict
@@ -14,29 +14,29 @@ from pipeline.extract.rows import ReadyRow
 from pipeline.vlm.preparation import TokenLayout
 from pipeline.vlm.qwen import FrozenVLM, Pending
 
-# Fewer rows are slower on any device; where these do not fit, an out-of-memory halves them.
+# Smaller batches are slower on any device. If this size does not fit, an out-of-memory halves it.
 _FIRST = 8
 
-# Beyond these, more rows gain nothing and only hold memory.
+# Larger batches are not faster and only take memory.
 _MOST = {"cpu": 64, "cuda": 512}
 
-# Batches of a size that are timed; the one before them warms up.
+# Timed batches per size, after one that warms up.
 #
-# The fastest counts: whatever else the machine does makes a batch slower, never faster.
+# The fastest counts: other load on the machine makes a batch slower, never faster.
 _MEASURED = 3
 
 # How much faster more rows must be to be worth their memory.
 _GAIN = 1.03
 
-# Sizes in a row that are no faster before the search ends: one may be a hiccup.
+# The search ends after this many sizes in a row that are no faster: one may be a hiccup.
 _MISSES = 2
 
 
 class BatchSize:
-    """The current batch size, of prepared rows.
+    """The current batch size, in prepared rows.
 
-    A number stays until memory runs out. "auto" doubles as long as that makes the model faster by
-    a few percent; then the smallest of the fastest sizes stays.
+    A fixed number stays until memory runs out. "auto" doubles the size as long as that makes the
+    model a few percent faster, and keeps the smallest of the fastest sizes.
     """
 
     def __init__(self, size: int | Literal["auto"], device: str = "cpu") -> None:
@@ -51,9 +51,9 @@ class BatchSize:
     def note(self, size: int, tokens: int, seconds: float) -> None:
         """Note how long a full batch of this size took.
 
-        Tokens, not rows, are counted: rows of another shape have more of them.
+        The speed counts tokens, because rows of another shape have another number of them.
         """
-        if self.settled or size != self.current:  # one more was under way when it changed
+        if self.settled or size != self.current:  # this batch had started before the size changed
             return
         self._speeds.append(tokens / max(seconds, 1e-9))
         if len(self._speeds) <= _MEASURED:
@@ -68,7 +68,7 @@ class BatchSize:
         self.current = self._best[1] if self.settled else self.current * 2
 
     def halve(self, failed: int, error: RuntimeError) -> None:
-        """Go on with half of what did not fit; `VLMError` where that was a single row."""
+        """Continue with half of the size that did not fit; `VLMError` if that was one row."""
         if failed == 1:
             raise VLMError(
                 f"out of memory with a single row ({error}). Use a GPU with more memory, a smaller "
@@ -83,8 +83,8 @@ class BatchSize:
 Encoded = tuple[list[ReadyRow], NDArray[Any]]
 
 
-# Rows that the model works on, variant after variant, in one pass or several; and the batch size,
-# where there are as many rows as it allows.
+# Rows that the model works on; their variants in one pass or several; and the batch size if the
+# batch is full.
 _Submitted = tuple[list[ReadyRow], list[Pending], int | None]
 
 
@@ -97,8 +97,8 @@ class Encoder:
     def __init__(
         self, vlm: FrozenVLM, batch_size: int | Literal["auto"], variants: int = 1
     ) -> None:
-        """With "auto" the first batches are measured, and the size settles where it is fastest."""
-        self.model_s = 0.0  # the time that the model worked on what was handed out so far
+        """With "auto" the first batches are timed, and the fastest size is kept."""
+        self.model_s = 0.0  # seconds the model worked on the features returned so far
         self._vlm = vlm
         self.size = BatchSize(batch_size, vlm.device.type)
         self._variants = variants
@@ -106,9 +106,9 @@ class Encoder:
     def encoded(self, rows: Iterable[ReadyRow]) -> Iterator[Encoded]:
         """Every row once, batch by batch, in any order.
 
-        On a GPU one batch is computed while the caller works on the one before. Raises
-        `NumericsError` that names the row, and variant, of a feature that is not finite, and
-        `VLMError` where memory does not suffice for a single row.
+        On a GPU one batch is computed while the caller works on the previous one. Raises
+        `NumericsError`, which names the row and variant of a feature that is not finite, and
+        `VLMError` where a single row does not fit in memory.
         """
         ahead: list[_Submitted] = []
         for batch in self._batches(rows):
@@ -121,9 +121,9 @@ class Encoder:
             yield from self._finished(submitted)
 
     def _batches(self, rows: Iterable[ReadyRow]) -> Iterator[list[ReadyRow]]:
-        """Full batches of equal shape as they come together; at the end the rest of each shape.
+        """Batches of equal shape as soon as they are full; at the end the rest of each shape.
 
-        When rows of many shapes wait, the largest group goes, so that few rows wait.
+        When too many rows of different shapes wait, the largest group is computed first.
         """
         waiting: dict[TokenLayout, list[ReadyRow]] = defaultdict(list)
         for row in rows:
@@ -137,7 +137,7 @@ class Encoder:
 
     @property
     def _rows(self) -> int:
-        """Rows a batch: at least one, whose variants may take several passes."""
+        """Rows per batch: at least one; its variants may take several passes."""
         return max(1, self.size.current // self._variants)
 
     def _submitted(self, rows: list[ReadyRow]) -> Iterator[_Submitted]:
@@ -162,7 +162,7 @@ class Encoder:
         try:
             features = [part.result()[0] for part in passes]
         except NumericsError:
-            for row in rows:  # computed alone, the row that is not finite is named
+            for row in rows:  # one by one, so that the error names the row
                 yield [row], _stored([row], [self._alone(row, v) for v in range(self._variants)])
             return
         seconds = sum(part.model_s for part in passes)
@@ -187,5 +187,5 @@ def _stored(rows: list[ReadyRow], features: list[torch.Tensor]) -> NDArray[Any]:
 
 
 def _out_of_memory(error: RuntimeError) -> bool:
-    """CUDA raises an exception of its own; the CPU allocator only says it in its message."""
+    """CUDA raises an exception of its own; the CPU allocator has only a message."""
     return isinstance(error, torch.OutOfMemoryError) or "can't allocate memory" in str(error)

@@ -1,8 +1,8 @@
-"""Fill the missing rows of a build: from older stores where they are known, else by the model.
+"""Fill the missing rows of a build: from older stores if they have them, else with the model.
 
-`fill` is the coordinator's side. An executor computes what no older store has: `compute_here` in
-this process, `pipeline.extract.cluster` on dask workers. Either way a `RowEngine` holds the model
-of a process.
+`fill` is the coordinator's side. An executor computes the rows that no older store has:
+`compute_here` in this process, `pipeline.extract.cluster` on dask workers. In both cases a
+`RowEngine` holds the model of a process.
 """
 
 import time
@@ -43,22 +43,23 @@ if TYPE_CHECKING:
 Work = TypeVar("Work")
 Made = TypeVar("Made")
 
-# Rows that one thread decodes in one go: long enough for video, short enough for memory.
-# Each variant counts as a row: it waits in memory alike.
+# Rows that one thread decodes at a time: enough for video, few enough for memory. Each variant
+# counts as a row, because it takes as much memory.
 RANGE_ROWS = 16
 
-# Blocks that are written or wait for it; the model waits when there are more: a kill loses few.
+# Most blocks that are being written or wait. The model waits when there are more, so that a kill
+# loses few rows.
 _WAITING = 2
 
-# Known or repeated rows that are written in one go: each time waits for the disk.
+# Known or repeated rows per write: each write waits for the disk.
 _TOGETHER = 64
 
 
 class Speed(NamedTuple):
     """How fast rows were computed; the shares are of the time since the model was loaded.
 
-    The model worked `model_share` of it and waited `waited_share` for frames to be decoded and
-    prepared. None where nobody measured it.
+    The model worked for `model_share` of that time and waited for `waited_share` of it until frames
+    were decoded and prepared. None where it was not measured.
     """
 
     rows_per_s: float | None = None
@@ -77,8 +78,8 @@ Executor = Callable[
 class ExtractionReport:
     """What was done.
 
-    `taken` rows come from an earlier store or build; `repeated` ones equal another row that was
-    `computed`. The shares are those of `Speed`.
+    `taken` rows come from an earlier store or build; `repeated` rows equal a `computed` row. The
+    shares are those of `Speed`.
     """
 
     store: Path
@@ -101,7 +102,7 @@ def fill(
 ) -> ExtractionReport:
     """Fill in the missing rows of a laid-out build.
 
-    Raises what the executor raises; what was marked until then is kept.
+    Raises what the executor raises; rows marked before are kept.
     """
     begun, total = time.monotonic(), build.specs["vl/time"].shape[0]
     frames, done = row_frames(build, surveyed), total - len(missing)
@@ -131,11 +132,11 @@ def fill(
 def _known_rows(
     surveyed: Survey, known: Sequence[RowSource], frames: RowFrames, missing: NDArray[np.int64]
 ) -> Iterator[KnownRow]:
-    """The missing rows that are known by content, instruction and frame times; decodes none."""
+    """The missing rows known by content, instruction and frame times; decodes no frame."""
     for index, rows in by_episode(missing, frames.vl_start):
         episode = surveyed.episodes[index]
-        of = episode.content, episode.recording.instruction
-        keys = [(source, source.keys_of(*of)) for source in known]
+        identity = episode.content, episode.recording.instruction
+        keys = [(source, source.keys_of(*identity)) for source in known]
         for row in rows.tolist():
             for source, by_frames in keys:
                 key = by_frames.get(frames.frame_time[row].tobytes())
@@ -158,7 +159,7 @@ class RowEngine:
         self._loaded_at = self._waited_s = 0.0
 
     def encode(self, prepared: Iterator[list[Row]], put: Callable[[FeatureBlock], object]) -> None:
-        """Hand over the features of all these rows, a repeated row's after those of its first."""
+        """Pass the features of all rows to `put`, those of a repeated row after its first row."""
         repeated: list[RepeatedRow] = []
         done: set[int] = set()
 
@@ -179,7 +180,7 @@ class RowEngine:
         assert not repeated, "a repeated row whose first was never computed"
 
     def speed(self, computed: int) -> Speed:
-        """How fast the model computed so many rows since it was loaded."""
+        """The speed since the model was loaded, in which it computed this many rows."""
         if self.encoder is None:
             return Speed()
         since = time.monotonic() - self._loaded_at
@@ -191,7 +192,7 @@ class RowEngine:
         repeated: list[RepeatedRow],
         put: Callable[[FeatureBlock], object],
     ) -> Iterator[ReadyRow]:
-        """The rows that are ready; repeated ones are set aside, known ones handed over."""
+        """The ready rows; repeated rows go to `repeated`, known rows to `put`."""
         while True:
             begun = time.monotonic()
             rows = next(prepared, None)
@@ -206,7 +207,7 @@ class RowEngine:
 
     def _loaded(self) -> "Encoder":
         if self.encoder is None:
-            # Seconds to import: a run that finds every row in an older store does without.
+            # The import takes seconds; a run that finds every row in an older store needs none.
             from pipeline.extract.encoder import Encoder
             from pipeline.vlm.qwen import FrozenVLM
 
@@ -225,12 +226,12 @@ def compute_here(
     missing: NDArray[np.int64],
     marks: RowMarks,
 ) -> Speed:
-    """The executor of this process: threads prepare, the calling one encodes, one commits."""
+    """The executor of this process: threads prepare, the caller's encodes, another commits."""
     extract = surveyed.params.extract
     engine = RowEngine(surveyed, frames, known, extract.device)
 
     def ranges_ahead() -> int:
-        """While the model has one batch, the next should be complete."""
+        """While the model works on one batch, the next should be complete."""
         return 2 * engine.encoder.size.current // RANGE_ROWS + 1 if engine.encoder else 0
 
     rows = in_background(
@@ -250,16 +251,17 @@ def in_background(
     threads: int,
     ahead: Callable[[], int] = lambda: 0,
 ) -> Generator[Made]:
-    """`make` of each piece of work, in order, as many pieces before the reader as `ahead` says.
+    """`make(piece)` for each piece of work, in order, made by threads ahead of the reader.
 
-    At least `threads + 1`, so that no thread waits for the reader.
+    `ahead()` says how many pieces ahead; at least `threads + 1`, so that no thread waits for the
+    reader.
     """
     with ThreadPoolExecutor(threads, thread_name_prefix="decode") as pool:
         pieces: Iterator[Work] = iter(work)
         made: deque[Future[Made]] = deque()
         try:
             while True:
-                lacking = max(threads + 1, ahead()) - len(made)  # below 0 once `ahead` has shrunk
+                lacking = max(threads + 1, ahead()) - len(made)  # below 0 after `ahead` shrank
                 made.extend(pool.submit(make, piece) for piece in islice(pieces, max(0, lacking)))
                 if not made:
                     return
@@ -270,16 +272,16 @@ def in_background(
 
 @contextmanager
 def _committing(marks: RowMarks) -> Generator[Callable[[FeatureBlock], None]]:
-    """A function that writes and marks blocks in order, on a thread, while the model goes on.
+    """A function that writes and marks blocks in order, on a thread, while the model works.
 
-    A later call raises what failed there. Leaving the context waits for what was handed in,
-    whatever else went wrong: it is computed.
+    A later call raises what failed there. On exit, also after an error, the context waits for all
+    blocks handed in, because they are computed.
     """
     pending: deque[Future[None]] = deque()
 
     def commit(block: FeatureBlock, before: Future[None] | None) -> None:
         if before is not None:
-            before.result()  # after a failure nothing: a repeated row is copied from one before
+            before.result()  # raises after a failure: a repeated row is copied from an earlier one
         marks.mark([block.write(marks.build)])
 
     def put(block: FeatureBlock) -> None:

@@ -1,4 +1,4 @@
-"""Choose the golden rows of a build; their frames come from the store before, or are decoded."""
+"""Choose the golden rows of a build; frames come from the previous store, or are decoded."""
 
 from collections.abc import Iterator
 
@@ -17,11 +17,11 @@ from pipeline.vlm.preparation import Preparer
 
 
 def keep_golden(build: StoreBuild, surveyed: Survey, places: StorePlaces, say: Say) -> None:
-    """Write the golden rows of a build whose rows are all there: at most four, evenly spread.
+    """Write the golden rows of a build that has all its rows: at most four, evenly spread.
 
-    Those that the store before has are taken from it, the others are decoded. A row whose frames
-    now decode to other pixels than it was computed from is left out, and `say` prints it. Raises
-    `RecordingError` where a recording is gone, and `DiskFull`.
+    Rows that the previous store has are copied from it, the others are decoded. A row is left out,
+    and `say` prints that, if its frames now decode to other pixels than when it was computed.
+    Raises `RecordingError` where a recording is gone, and `DiskFull`.
     """
     frames = row_frames(build, surveyed)
     views = np.isfinite(frames.frame_time).sum(axis=1)
@@ -38,9 +38,9 @@ def keep_golden(build: StoreBuild, surveyed: Survey, places: StorePlaces, say: S
 
 
 def _carried(build: StoreBuild, surveyed: Survey, places: StorePlaces) -> dict[int, GoldenFrames]:
-    """The golden frames, by row, of the store before and of the one before it.
+    """The golden frames, by row, of the current store and the previous one.
 
-    Of a store under repair, too: damaged frames do not give their key and are left out.
+    A store under repair counts too: damaged frames do not give their key and are left out.
     """
     keys = build.files(KEYS).read(0, build.specs[KEYS].shape[0])
     carried: dict[int, GoldenFrames] = {}

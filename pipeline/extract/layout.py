@@ -38,7 +38,7 @@ def check_readable(build: StoreBuild, checked: Sequence[CheckedEpisode], survey:
     """Raise `RecordingError` where readers would refuse the attributes of the store."""
     where = build.target / "zarr.json"
     text = json.dumps(_attributes(checked, survey) | {"plan": build.plan}, indent=2)
-    if len(text) > MOST_BYTES // 2:  # golden rows and environments come yet
+    if len(text) > MOST_BYTES // 2:  # golden rows and environments are added later
         why = f"expected attributes of at most {MOST_BYTES // 2:,} bytes, found {len(text):,}"
         raise _READERS.refusal(where, why)
     StoreAttributes.of(build.target, _READERS.parse_json(text, dict[str, Any], where), _READERS)
@@ -49,7 +49,7 @@ def check_readable(build: StoreBuild, checked: Sequence[CheckedEpisode], survey:
 def check_space(
     build: StoreBuild, checked: Sequence[CheckedEpisode], known: Sequence[RowSource]
 ) -> None:
-    """Raise `DiskFull` where the store will not fit, chunks that can be linked left out."""
+    """Raise `DiskFull` where the store will not fit; chunks that can be linked do not count."""
     linked = sum(
         build.linkable(name, source.specs[name], rows) * build.specs[name].chunk_bytes
         for source, name, rows in _linkable(build, checked, known)
@@ -69,7 +69,7 @@ def lay_out(
 ) -> None:
     """Write streams, ticks and episodes, linking unchanged chunks of a finished store.
 
-    The build counts as laid out after `finish_layout`. Raises `DiskFull`.
+    The build is laid out only after `finish_layout`. Raises `DiskFull`.
     """
     build.create()
     for source, name, rows in _linkable(build, checked, known):
@@ -86,7 +86,7 @@ def lay_out(
 
 
 def finish_layout(build: StoreBuild, checked: Sequence[CheckedEpisode], survey: Survey) -> None:
-    """Write checksums and attributes, the plan last: from here on the build resumes."""
+    """Write checksums and attributes, the plan last; after that a build can be resumed."""
     attributes = _attributes(checked, survey)
     build.finish_layout(attributes, {"slots": attributes["slots"]})
 
@@ -119,7 +119,8 @@ def _linkable(
 ) -> Iterator[tuple[RowSource, str, int]]:
     """Stream arrays of a finished store, and how many of their first rows are the same here.
 
-    Those of the leading episodes of unchanged content; only whole chunks of them can be linked.
+    These are the rows of the leading episodes with unchanged content; only whole chunks can be
+    linked.
     """
     for source in known:
         if source.path == build.target:
@@ -132,7 +133,7 @@ def _linkable(
 
 
 def _slot_valid(line: Timeline, spec: FeatureSpec) -> NDArray[np.uint8]:
-    """A slot of a view needs that view; `image_mean` needs any."""
+    """The valid slots, (vl_row, slot): a view's slot needs that view, `image_mean` any view."""
     valid = [
         slot.view in line.frames
         if slot.view is not None
@@ -143,7 +144,7 @@ def _slot_valid(line: Timeline, spec: FeatureSpec) -> NDArray[np.uint8]:
 
 
 def _write_streams(build: StoreBuild, episode: CheckedEpisode, starts: dict[str, int]) -> None:
-    """Write an episode's readings at `starts`, and move these behind them."""
+    """Write an episode's readings at `starts`, and advance `starts` past them."""
     recording = episode.recording
     for kind, stream in (("sensor", recording.sensor()), ("state", recording.state())):
         if stream is not None:

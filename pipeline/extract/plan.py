@@ -1,4 +1,4 @@
-"""What an extraction would do, and why; said before anything is done."""
+"""What an extraction will do, and why; printed before anything is done."""
 
 from collections.abc import Iterator, Sequence
 
@@ -25,8 +25,8 @@ def plan_lines(
 
     `sources` are stores and builds of the same feature spec.
     """
-    there = {text.digest for source in sources for text in source.texts}
-    unchanged = sum(episode.digest in there for episode in surveyed.episodes)
+    known_digests = {text.digest for source in sources for text in source.texts}
+    unchanged = sum(episode.digest in known_digests for episode in surveyed.episodes)
     begun = places.begun == surveyed.plan
     place = places.part if begun or places.repaired else places.target
     before = None if read_plan(place) is None else RowSource(place)
@@ -60,14 +60,14 @@ def plan_lines(
 
 
 def store_bytes(specs: dict[str, ArraySpec]) -> int:
-    """Bytes that a store's rows take."""
+    """Bytes of all rows of a store."""
     return sum(spec.data_bytes for spec in specs.values())
 
 
 def _reasons(
     surveyed: Survey, before: RowSource | None, specs: dict[str, ArraySpec]
 ) -> Iterator[str]:
-    """Why the present store, if any, does not suffice."""
+    """Why the existing store, if any, is not enough."""
     if before is None:
         yield "there is no store yet"
         return
@@ -76,8 +76,8 @@ def _reasons(
     digests = {text.digest for text in before.texts}
     changed = [episode for episode in surveyed.episodes if episode.digest not in digests]
     here = {episode.digest for episode in surveyed.episodes}
-    again = {episode.content for episode in changed}  # counted among the new ones
-    gone = sum(text.digest not in here and text.content not in again for text in before.texts)
+    revised = {episode.content for episode in changed}  # these count as changed
+    gone = sum(text.digest not in here and text.content not in revised for text in before.texts)
     if changed:
         what = "files, how these are read, instruction, name, place, action_hz or vlm_reuse_count"
         yield f"{len(changed)} episode(s) are new or have other {what}"
@@ -96,14 +96,14 @@ def _reasons(
 
 
 def _warnings(surveyed: Survey, before: RowSource | None, missing: int) -> Iterator[str]:
-    """What the user may not intend, each with the way out."""
+    """What the user may not intend, each with what to do about it."""
     params, recordings, views = surveyed.params, surveyed.recordings, surveyed.spec.views
     known = before.attributes.feature_spec.views if before else []
     if known and (added := set(views) - set(known)):
-        having = sum(not added.isdisjoint(recording.view_names()) for recording in recordings)
+        count = sum(not added.isdisjoint(recording.view_names()) for recording in recordings)
         kept = setting("data.views", [view for view in known if view in views])
         yield (
-            f"{having} of {len(recordings)} episode(s) have {', '.join(sorted(added))}, which the "
+            f"{count} of {len(recordings)} episode(s) have {', '.join(sorted(added))}, which the "
             "store does not have. The model sees all views of a store at a time, so that every row "
             f"of every episode is computed again. To keep the rows: {kept}"
         )
@@ -121,7 +121,7 @@ def _warnings(surveyed: Survey, before: RowSource | None, missing: int) -> Itera
             "euler_delta in place of rotvec. To keep rotvec: give these a store of their own. To "
             "say that it is meant: --set data.action_rotation=euler_delta"
         )
-    # What the workers of a dask scheduler have is not known.
+    # The devices of the workers of a dask scheduler are not known.
     if missing and params.vlm.dtype != "float32" and isinstance(params.extract.workers, int):
         from pipeline.base.device import resolve_device  # torch takes a second to import
 
@@ -136,11 +136,11 @@ def _warnings(surveyed: Survey, before: RowSource | None, missing: int) -> Itera
 def count_known(
     checked: Sequence[CheckedEpisode], surveyed: Survey, sources: Sequence[RowSource]
 ) -> int:
-    """How many rows of these episodes are in `sources`, judged by frame times alone."""
+    """How many rows of these episodes are in `sources`, by content, instruction and frame times."""
     count = 0
     for episode in checked:
-        of = episode.fields["content"], episode.fields["instruction"]
-        times = set().union(*(source.keys_of(*of) for source in sources))
+        identity = episode.fields["content"], episode.fields["instruction"]
+        times = set().union(*(source.keys_of(*identity) for source in sources))
         rows = episode.ticks.frame_times(surveyed.spec.views)
         count += sum(row.tobytes() in times for row in rows)
     return count

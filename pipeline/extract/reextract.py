@@ -29,11 +29,12 @@ from pipeline.vlm.qwen import FrozenVLM
 
 @dataclass(frozen=True)
 class Deviation:
-    """How far a row that was computed now is from the stored one.
+    """How far a row that was computed again is from the stored one.
 
     `relative` is the largest deviation of all variants and slots, as a share of the root mean
-    square of the stored slot; `slot` is its number, counted over both. `same_pixels`: the frames
-    decode to the pixels that the stored key is of. `where` is recording and row.
+    square of the stored slot; `slot` is the index of that slot, counted over variants and slots.
+    `same_pixels` says whether the frames and prompt still give the stored key. `where` names the
+    recording and the row.
     """
 
     row: int
@@ -55,8 +56,8 @@ class Deviation:
 class Reextraction:
     """The deviations of all computed rows, the largest first.
 
-    `unchecked` are ids of episodes whose recordings changed or are gone; `environment` lists where
-    the present software or hardware is not that of the rows.
+    `unchecked` has the ids of episodes whose recordings changed or are gone; `environment` lists
+    how the software and hardware of the rows differ from the present ones.
     """
 
     deviations: tuple[Deviation, ...]
@@ -66,7 +67,7 @@ class Reextraction:
 
     @property
     def beyond(self) -> list[Deviation]:
-        """Rows beyond the tolerance; a NaN always is."""
+        """Rows beyond the tolerance, and those with a NaN."""
         return [row for row in self.deviations if not row.relative <= self.tolerance]
 
     def lines(self) -> list[str]:
@@ -92,11 +93,12 @@ class Reextraction:
 def reextract(path: Path, params: Params, say: Callable[[str], None]) -> Reextraction:
     """Compute `verify.reextract` random rows of a store again, each with all its variants.
 
-    Reads the recordings that the store was made of; episodes whose recordings changed are left out
-    and named. Raises `StoreMismatch` where the params describe features of another
-    kind than the store's, and `NumericsError` where a feature is NaN or infinite.
+    Reads the recordings that the store was made of; leaves out and names episodes whose recordings
+    changed. Raises `StoreMismatch` where the params describe other features than the store's, and
+    `NumericsError` where a feature is NaN or infinite.
 
-    The tolerance is `verify.tolerance`, else that of the coarser of compute and storage dtype.
+    The tolerance is `verify.tolerance`, or by default that of the coarser of the compute and the
+    storage dtype.
     """
     store, options = FeatureStore.open(path), params.verify
     with closing(ContentDigests(ledger_path(path))) as digests:
@@ -109,20 +111,20 @@ def reextract(path: Path, params: Params, say: Callable[[str], None]) -> Reextra
             + "\n  ".join(describe(other))
             + "\nRun with the params that it was extracted with, or extract it anew."
         )
-    today = {episode.digest: episode.recording for episode in surveyed.episodes}
-    known = [episode for episode in store.episodes if episode.digest in today]
-    unchecked = tuple(episode.id for episode in store.episodes if episode.digest not in today)
+    current = {episode.digest: episode.recording for episode in surveyed.episodes}
+    known = [episode for episode in store.episodes if episode.digest in current]
+    unchecked = tuple(episode.id for episode in store.episodes if episode.digest not in current)
     tolerance = options.tolerance or tolerance_of(store.spec)
     stored = np.array([row for episode in known for row in episode.vl_rows], np.int64)
-    drawn = np.random.default_rng(options.seed)
-    rows = np.sort(drawn.choice(stored, min(options.reextract, len(stored)), replace=False))
+    generator = np.random.default_rng(options.seed)
+    rows = np.sort(generator.choice(stored, min(options.reextract, len(stored)), replace=False))
     if not len(rows):
         return Reextraction((), tolerance, unchecked, ())
     say(f"computing {len(rows)} rows again")
     vlm = FrozenVLM.load(params.vlm, spec, params.extract.device)
     environments = environment_runs(store.attrs["environment"], rows)
     differing = (describe(differences(then, vlm.environment)) for then, _ in environments)
-    recordings = {episode.index: today[episode.digest] for episode in known}
+    recordings = {episode.index: current[episode.digest] for episode in known}
     vl_start, frame_time = (store.array(name) for name in ("episode/vl_start", "vl/frame_time"))
     frames = RowFrames(recordings, vl_start, frame_time, spec.views)
     preparation = RowPreparation(surveyed, ())
@@ -143,9 +145,9 @@ def reextract(path: Path, params: Params, say: Callable[[str], None]) -> Reextra
 
 
 def _compare(store: FeatureStore, row: ReadyRow, features: NDArray[Any]) -> Deviation:
-    """Compare the stored row with features (variant x slot, dim) of now, both as stored."""
-    apart = slot_deviations(widen(store.array(FEATURES)[row.row]), widen(features))
-    slot = apart.worst
+    """Compare the stored row with new features (variant x slot, dim), both in storage dtype."""
+    deviations = slot_deviations(widen(store.array(FEATURES)[row.row]), widen(features))
+    slot = deviations.worst
     same_pixels = store.array("vl/key")[row.row].tobytes() == row.key
-    absolute, relative = float(apart.absolute.max()), float(apart.relative[slot])
+    absolute, relative = float(deviations.absolute.max()), float(deviations.relative[slot])
     return Deviation(row.row, absolute, relative, slot, same_pixels, row.where)

@@ -1,8 +1,8 @@
 """Begin the repair of a damaged store: a build of its own plan that lacks the damaged rows.
 
-What is sound is linked or copied into `<name>.zarr.part`, what is not is laid out anew from the
-recordings; `stages.extract` computes the missing rows. The plan is written last: a kill leaves a
-part that the next repair empties. The damaged store is only read.
+Sound data are linked or copied into `<name>.zarr.part`; damaged streams, ticks and episodes are
+laid out again from the recordings; `stages.extract` computes the missing rows. The plan is written
+last: after a kill, the next repair empties the part. The damaged store is only read.
 """
 
 from contextlib import closing
@@ -41,11 +41,11 @@ _NOT_TAKEN = ("plan", METADATA_DIGEST, SEAL, GOLDEN)
 
 
 def repair(verification: Verification, params: Params, say: Say) -> None:
-    """Begin a build of the same plan without what is damaged.
+    """Begin a build of the same plan without the damaged rows.
 
-    Where more than feature rows is damaged, streams, ticks and episodes are laid out anew from the
-    recordings, which must be those that the store was made of; every sound feature row keeps its
-    place. Raises `StoreMismatch` where they are not, or where another build is unfinished.
+    Where more than feature rows is damaged, streams, ticks and episodes are laid out again from the
+    recordings; every sound feature row keeps its place. Raises `StoreMismatch` where the recordings
+    are not those that the store was made of, or where another build is unfinished.
     """
     store = verification.store
     part = part_path(store)
@@ -81,16 +81,16 @@ def repair(verification: Verification, params: Params, say: Say) -> None:
 
 
 def layout_is_sound(verification: Verification) -> bool:
-    """Whether all that needs no model can be taken over as it is: streams, ticks, episodes."""
+    """Whether the streams, ticks and episodes can be taken over as they are."""
     return all(
         issue.stream in INCREMENTAL and issue.chunk is not None for issue in verification.damaged
     )
 
 
 def begin_from_store(verification: Verification) -> tuple[int, int]:
-    """Begin the build with the chunks of a store whose layout is sound, and its sound rows.
+    """Begin the build with the layout of a store, which must be sound, and its sound rows.
 
-    Returns how many feature rows the store has and how many of them the build has.
+    Returns the number of feature rows in the store and the number taken over.
     """
     store = verification.store
     specs = read_specs(store)
@@ -116,7 +116,7 @@ def begin_from_store(verification: Verification) -> tuple[int, int]:
 def _begin_from_recordings(
     verification: Verification, plan: str, params: Params, completed_by: str
 ) -> tuple[int, int]:
-    """As `begin_from_store`, with everything but the feature rows from the recordings."""
+    """Like `begin_from_store`, but lays out everything except the feature rows anew."""
     store = verification.store
     with closing(ContentDigests(ledger_path(store))) as digests:
         surveyed, checked = sound_episodes(survey(params, digests), digests)
@@ -137,10 +137,10 @@ def _begin_from_recordings(
 
 
 def _carry_rows(verification: Verification, build: StoreBuild) -> int:
-    """Take the sound feature rows over, each to its place, and mark them; returns how many.
+    """Take the sound feature rows over, each in its place, and mark them; returns how many.
 
-    Not those whose key lies in a damaged chunk of keys, for a key has no checksum of its own.
-    Raises `StoreMismatch` where another store took the place of the one that was checked.
+    Rows whose key lies in a damaged chunk of keys are left out, because a key has no checksum of
+    its own. Raises `StoreMismatch` where another store replaced the one that was checked.
     """
     store = verification.store
     refuse_replaced(store, verification.inode)
@@ -151,12 +151,12 @@ def _carry_rows(verification: Verification, build: StoreBuild) -> int:
         sound[rows.start : rows.stop] = False
     for name in INCREMENTAL:
         build.files(name).close()
-        for path in build.files(name).paths:  # of zeros, where it was laid out anew
+        for path in build.files(name).paths:  # all zero if it was laid out anew
             path.unlink(missing_ok=True)
-    # Chunk files in which everything is sound are linked; of the others, sound rows are copied.
+    # Chunk files without damage are linked; from the others, the sound rows are copied.
     spec, damaged = build.specs[FEATURES], verification.damaged_chunks(FEATURES)
     step = max(1, _BLOCK_BYTES // max(1, spec.row_bytes))
-    with closing(ChunkFiles(build.part, spec)) as files:  # which leaves linked chunks as they are
+    with closing(ChunkFiles(build.part, spec)) as files:  # it does not write to linked chunks
         for chunk, path in enumerate(chunk_paths(store, spec)):
             rows = spec.chunk_rows_of(chunk)
             if chunk not in damaged and sound[rows.start : rows.stop].all():

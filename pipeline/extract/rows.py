@@ -1,6 +1,7 @@
 """VL rows on their way into a build: read, known or made ready for the model, written, marked.
 
-Any process may write features; the coordinating one alone marks them, and only then do they count.
+Any process may write features, but only the coordinating one marks them, and only marked rows
+count.
 """
 
 import threading
@@ -33,9 +34,9 @@ class KnownRow:
 
 @dataclass(frozen=True)
 class ReadyRow:
-    """A row ready for the model: its frames as they are, then augmented; all of one shape.
+    """A row ready for the model: variant 0 with plain frames, then augmented; all of one shape.
 
-    `where` is recording and row, for messages.
+    `where` names the recording and the row, for messages.
     """
 
     row: int
@@ -57,7 +58,7 @@ Row = KnownRow | ReadyRow | RepeatedRow
 
 
 class RowPreparation:
-    """Turns row ranges into rows; used from several threads."""
+    """Turns row ranges into rows; several threads may use it."""
 
     def __init__(self, surveyed: Survey, known: Sequence[RowSource]) -> None:
         """Rows whose key is in `known` are taken from there."""
@@ -67,10 +68,10 @@ class RowPreparation:
         self._lock = threading.Lock()
 
     def prepare(self, rows: RowRange, firsts: dict[bytes, int] | None = None) -> list[Row]:
-        """The rows of a range; each decoded frame is held only while its row is made.
+        """The rows of a range; each decoded frame is kept only while its row is made.
 
-        `firsts` notes the first row of each key, and only that one is made ready; without it, all
-        rows are. Raises what the recording raises.
+        `firsts` keeps the first row of each key, and only that row is made ready; without `firsts`,
+        all rows are. Raises what the recording raises.
         """
         prompt = self._preparer.render(rows.recording.instruction, list(rows.frames))
         return [self._row(rows, row, frames, prompt, firsts) for row, frames in rows.read()]
@@ -93,7 +94,7 @@ class RowPreparation:
 
 @dataclass(frozen=True)
 class WrittenRows:
-    """Feature rows that lie in the build and are not marked yet."""
+    """Feature rows that are written in the build but not marked yet."""
 
     origin: Literal["computed", "known", "repeated"]
     rows: NDArray[np.int64]
@@ -104,9 +105,9 @@ class WrittenRows:
 
 @dataclass(frozen=True)
 class FeatureBlock:
-    """Rows of one environment with their features (row, variant x slot, dim), as they are stored.
+    """Rows of one environment with their features (row, variant x slot, dim), as stored.
 
-    The features of repeated rows are None: they are read from their firsts.
+    The features of repeated rows are None: `write` reads them from their first rows.
     """
 
     origin: Literal["computed", "known", "repeated"]
@@ -128,8 +129,8 @@ class FeatureBlock:
 
 def known_blocks(rows: Sequence[KnownRow]) -> Iterator[FeatureBlock]:
     """Consecutive known rows of one environment as blocks."""
-    for environment, alike in groupby(rows, attrgetter("environment")):
-        block = list(alike)
+    for environment, group in groupby(rows, attrgetter("environment")):
+        block = list(group)
         features = np.stack([row.features for row in block])
         yield FeatureBlock("known", block, features, environment)
 
@@ -143,9 +144,9 @@ class RowMarks:
         self._bar = bar
 
     def mark(self, written: Iterable[WrittenRows]) -> None:
-        """Mark rows, those of one environment together: each mark waits for the disk."""
-        for environment, alike in groupby(written, attrgetter("environment")):
-            blocks = list(alike)
+        """Mark rows, grouped by environment because each mark waits for the disk."""
+        for environment, group in groupby(written, attrgetter("environment")):
+            blocks = list(group)
             rows = np.concatenate([block.rows for block in blocks])
             keys = [key for block in blocks for key in block.keys]
             checksums = np.concatenate([block.checksums for block in blocks])
@@ -156,7 +157,7 @@ class RowMarks:
 
 
 def row_frames(build: StoreBuild, surveyed: Survey) -> RowFrames:
-    """The frames of a laid-out build's rows, by the times in it: no stream is read again."""
+    """The frames of a laid-out build's rows, found by its stored times; reads no stream."""
     vl_start, frame_time = (
         build.files(name).read(0, build.specs[name].shape[0])
         for name in ("episode/vl_start", "vl/frame_time")

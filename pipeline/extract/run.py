@@ -37,10 +37,10 @@ from pipeline.store.paths import refuse_foreign_store
 
 
 def extract(params: Params, say: Say) -> ExtractionReport | None:
-    """Make `extract.store` hold exactly what `params` describe; None where it does already.
+    """Make `extract.store` hold exactly what `params` describe; None where it already does.
 
-    Resumes an interrupted build of the same plan, takes known rows over from stores and builds of
-    the same feature spec, and computes the rest. With `extract.plan` it only says what it would do.
+    Resumes an interrupted build of the same plan, takes known rows from stores and builds of the
+    same feature spec, and computes the rest. With `extract.plan` it only prints what it would do.
     """
     target, only_plan = params.extract.store, params.extract.plan
     with _opened(target, only_plan) as (digests, unwritable):
@@ -50,7 +50,7 @@ def extract(params: Params, say: Say) -> ExtractionReport | None:
         for line in _survey_lines(surveyed):
             say(line)
         if state == "current":
-            FeatureStore.open(target)  # refuses a store that is not as it was sealed
+            FeatureStore.open(target)  # refuses a store that changed after sealing
             if not only_plan and unwritable is None:
                 places.drop_previous(surveyed)
             say(f"{target}: up to date, nothing to do (stages.verify reads what it holds)")
@@ -85,7 +85,7 @@ def extract(params: Params, say: Say) -> ExtractionReport | None:
                     from pipeline.extract.cluster import check_scheduler  # dask: a second to import
 
                     check_scheduler(params.extract.workers)
-                # Nothing can refuse the run any more.
+                # From here on, no check refuses the run.
                 places = places.set_build_aside(surveyed, say)
                 lay_out(build, checked, surveyed, row_sources(places.known, surveyed))
                 finish_layout(build, checked, surveyed)
@@ -98,9 +98,9 @@ def extract(params: Params, say: Say) -> ExtractionReport | None:
 
 @contextmanager
 def _opened(target: Path, only_plan: bool) -> Generator[tuple[ContentDigests, OSError | None]]:
-    """The digests that are remembered beside the store, which nobody else builds meanwhile.
+    """The digests kept beside the store, and the store's lock while the context is open.
 
-    With the error of what cannot be written there: a store that is up to date needs no writing.
+    Also the error if nothing can be written there: a store that is up to date needs no write.
     """
     read, unwritable = ContentDigests.to_read, None
     with ExitStack() as stack:
@@ -121,10 +121,10 @@ def _opened(target: Path, only_plan: bool) -> Generator[tuple[ContentDigests, OS
 def _survey(
     params: Params, digests: ContentDigests, places: StorePlaces
 ) -> tuple[Survey, list[CheckedEpisode]]:
-    """What is to be in the store; for a new build, each of its episodes read whole and sound."""
+    """The survey; for a new build also its sound episodes, each read completely."""
     surveyed = survey(params, digests)
     if surveyed.bad and params.data.on_bad_episode == "stop":
-        check_episodes(surveyed)  # lists them with whatever else is wrong
+        check_episodes(surveyed)  # lists them with everything else that is wrong
     state = places.state(surveyed.plan)
     if state != "current":
         resolve_device(params.extract.device)
@@ -132,7 +132,7 @@ def _survey(
 
 
 def _executor(surveyed: Survey) -> Executor:
-    """Where rows are computed: in this process, or by the dask workers of `extract.workers`."""
+    """The executor: this process, or the dask workers of `extract.workers`."""
     if surveyed.params.extract.workers == 0:
         return compute_here
     from pipeline.extract.cluster import compute_on_cluster  # dask: a second to import

@@ -1,12 +1,12 @@
-"""What lies at the places of a store, and so what a run does: its `BuildState`.
+"""What is at the three places of a store, and what a run does then: its `BuildState`.
 
     current   the store is of the run's plan: nothing is done
     resume    the part is of the run's plan, and as it was laid out: its missing rows are filled in
     new       a part is laid out, and its rows are filled in
 
-A part of another plan is set aside within the new one (`pipeline.store.paths`). Rows are taken by
-key from every store and build that is there; the rest is computed. A part of the plan of the store
-beside it is a repair, which lacks the rows that are damaged there.
+A part of another plan is set aside within the new one (`pipeline.store.paths`). A run takes rows by
+key from every store and build that is there, and computes the rest. A part with the same plan as
+the store beside it is a repair, which lacks the damaged rows of that store.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -31,11 +31,11 @@ _SHOWN = 6
 
 
 class StorePlaces:
-    """What lies at the three places of a store.
+    """What is at the three places of a store.
 
     `begun` and `finished` are the plans of the build and of the store, None where there is none.
-    `aside` are interrupted builds of other plans, `stores` the store and the previous one, where
-    they are there: a copy that a user made of the previous one is none.
+    `aside` has the interrupted builds of other plans, `stores` the store and the previous one if
+    they exist. A user's own copy in the previous store's place does not count.
     """
 
     def __init__(self, target: Path) -> None:
@@ -46,7 +46,7 @@ class StorePlaces:
         self.stores = [target] * (self.finished is not None) + [self.previous] * self.kept
 
     def state(self, plan: str) -> BuildState:
-        """What a run of this plan does."""
+        """The state for a run of this plan."""
         if self.begun == plan:
             return "resume" if self.layout_damage is None else "new"
         return "current" if self.finished == plan else "new"
@@ -59,15 +59,15 @@ class StorePlaces:
 
     @property
     def known(self) -> list[Path]:
-        """The builds and stores whose rows a build takes, its own part left out.
+        """The builds and stores from which a build takes rows, without its own part.
 
-        Not the stores once a repair has begun: their damage must not come back.
+        After a repair has begun, stores are left out: their damage must not come back.
         """
         return self.aside if self.repaired else [*self.aside, *self.stores]
 
     @cached_property
     def layout_damage(self) -> str | None:
-        """What is wrong with all but the feature rows of the build."""
+        """What is wrong with the build, apart from its feature rows; None where nothing is."""
         with closing(self.begun_build()) as build:
             return build.layout_damage()
 
@@ -76,7 +76,7 @@ class StorePlaces:
         return StoreBuild(self.target, read_specs(self.part), self.begun or "")
 
     def set_build_aside(self, surveyed: Survey, say: Say) -> "StorePlaces":
-        """The places without the build; its rows stay known unless its feature spec is another."""
+        """The places without the build; its rows stay known if the feature spec is the same."""
         if self.begun is not None:
             before = RowSource(self.part).attributes
             if before.feature_spec.digest == surveyed.spec.digest:
@@ -86,9 +86,9 @@ class StorePlaces:
         return StorePlaces(self.target)
 
     def keeping_note(self, surveyed: Survey) -> list[str]:
-        """What becomes of the store and the previous one where the run lacks episodes of them.
+        """What happens to the store and the previous one if the run lacks some of their episodes.
 
-        Raises `ConfigError` where something else lies where the store would be kept.
+        Raises `ConfigError` where something else lies in the previous store's place.
         """
         lost, contents, lines = self._lost(surveyed), surveyed.contents, list[str]()
         if lost and self.finished:
@@ -110,7 +110,7 @@ class StorePlaces:
         return lines
 
     def put_in_place(self, build: StoreBuild, surveyed: Survey, say: Say) -> None:
-        """Seal a build; keep the store before where it has episodes that the build lacks."""
+        """Seal a build; keep the replaced store if it has episodes that the build lacks."""
         keep = self._lost(surveyed) is not None
         build.seal(keep=keep)
         if keep:
@@ -119,12 +119,12 @@ class StorePlaces:
             remove_folder(self.previous, KEPT)
 
     def drop_previous(self, surveyed: Survey) -> None:
-        """Remove the previous store where a kill left it although all its episodes are here."""
+        """Remove a previous store that a kill left, if the run has all its episodes."""
         if self.kept and {*(_contents(self.previous) or [""])} <= surveyed.contents:
             remove_folder(self.previous, KEPT)
 
     def _lost(self, surveyed: Survey) -> str | None:
-        """Which episodes of the store before are not in this run; None: all are."""
+        """Which episodes of the existing store are not in this run; None if all are."""
         if not self.stores or read_plan(self.stores[0]) == surveyed.plan:
             return None
         if (known := _contents(self.stores[0])) is None:
@@ -135,14 +135,15 @@ class StorePlaces:
         return what if lost else None
 
     def refuse_to_lose(self, surveyed: Survey, embodiment: Embodiment) -> None:
-        """Raise `StoreMismatch` where rows would be lost that these params cannot give again.
+        """Raise `StoreMismatch` where the run would lose rows that these params cannot make again.
 
-        Those of a merged store, or one under repair, with recordings that params do not name: who
-        follows the advice of a check may run under other params than that store's own. And those of
-        a store or build without an episode in common, of another embodiment or other sources only.
+        This is so for a merged store, or one under repair, with recordings that the params do not
+        name: a user who follows the advice of a check may run with other params than that store's.
+        It is also so for a store or build that has no episode in common with the run, and another
+        embodiment or only other sources.
         """
         under_repair = self.finished is not None and self.finished == self.begun
-        # A store under repair may be one whose metadata are damaged: its build says what it holds.
+        # The metadata of a store under repair may be damaged; its build says what it holds.
         target = None if under_repair else self.finished
         for place, plan in ((self.target, target), (self.part, self.begun)):
             if plan is not None:
@@ -192,7 +193,7 @@ def _contents(store: Path) -> list[str] | None:
 
 
 def spec_differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
-    """What differs between two feature specs, without all that follows from it."""
+    """How two feature specs differ, without the entries that follow from other entries."""
     differing = differences(before, now)
     first = {
         place: values

@@ -1,9 +1,9 @@
 """Which episodes there are, what they hold, and whether each can be used.
 
 A survey reads no sensor and decodes no frame. Its plan digest covers everything that decides what a
-store holds: where a finished store has the same, there is nothing to do. `check_episodes` then
-reads every episode whole, before the first byte is written, so that everything that is wrong is
-listed at once, before anything expensive runs.
+store holds: if a finished store has the same digest, there is nothing to do. `check_episodes` reads
+every episode completely before the first byte is written, so that all faults are listed at once,
+before anything expensive runs.
 """
 
 import json
@@ -35,17 +35,17 @@ _STORED = Border(
     RecordingError,
     "No store could be read with it: rename or shorten it there, or leave the episode out.",
 )
-"""Refuses an episode whose texts the readers of a store would refuse."""
+"""Refuses an episode whose texts a store's readers would refuse."""
 
 _DECIDES_SPEED = ("weights", "adapter", "processor", "compute_dtype", "variants")
 
 MOST_EPISODES = 10
-"""How many unusable episodes a message lists; the rest is counted."""
+"""How many unusable episodes a message lists; it only counts the rest."""
 
 
 @dataclass(frozen=True)
 class SurveyedEpisode:
-    """A recording, and the texts that the store keeps of it, its digests among them."""
+    """A recording, and the texts that the store keeps about it, including its digests."""
 
     recording: Recording
     text: Mapping[str, str]
@@ -58,15 +58,15 @@ class SurveyedEpisode:
 
     @property
     def digest(self) -> str:
-        """Digest of content and of everything else that decides its part of the store."""
+        """Digest of the content and of everything else that decides its rows in the store."""
         return self.text["digest"]
 
 
 @dataclass(frozen=True)
 class Survey:
-    """What the store is to hold.
+    """What the store will hold.
 
-    `missing` names episodes that a data set's metadata list and its files lack. `plan` is the
+    `missing` names episodes that a data set's metadata list but its files lack. `plan` is the
     digest of everything that decides what the store holds.
     """
 
@@ -85,7 +85,7 @@ class Survey:
 
     @property
     def recordings(self) -> list[Recording]:
-        """Of the episodes, in order."""
+        """The recordings of the episodes, in order."""
         return [episode.recording for episode in self.episodes]
 
     @property
@@ -95,29 +95,30 @@ class Survey:
 
     @property
     def rate_name(self) -> str:
-        """The name under which the speed of this model on these devices is remembered.
+        """The name under which the speed of this model on these devices is stored.
 
-        What else differs between specs, such as prompt, slots or names of views, costs little.
+        It leaves out what costs little time, such as the prompt, slots and names of views.
         """
         extract, spec = self.params.extract, self.spec.attrs()
         by = f" on {extract.workers}" if extract.workers != 0 else ""
-        alike = {name: spec.get(name) for name in _DECIDES_SPEED} | {"views": len(spec["views"])}
-        return f"{joint_digest(json.dumps(alike, sort_keys=True))} {extract.device}{by}"
+        deciding = {name: spec.get(name) for name in _DECIDES_SPEED} | {"views": len(spec["views"])}
+        return f"{joint_digest(json.dumps(deciding, sort_keys=True))} {extract.device}{by}"
 
 
 @dataclass(frozen=True)
 class CheckedEpisode(EpisodeRows):
-    """An episode that was read whole and is sound; its streams are let go again."""
+    """An episode that was read completely and is sound; its streams are not kept in memory."""
 
     recording: Recording
     embodiment: Embodiment
 
 
 def survey(params: Params, digests: ContentDigests) -> Survey:
-    """Open every source, take the content digest of its files and name the feature spec.
+    """Open every source, take the content digest of its files and make the feature spec.
 
     With `data.on_bad_episode: skip`, episodes that an earlier check found bad are left out. Raises
-    `RecordingError` when no episode is usable, and whatever a source as a whole is refused for.
+    `RecordingError` when no episode is usable, and the error of a source that is refused as a
+    whole.
     """
     data = params.data
     opened = open_recordings(data.sources, data.root, data.views)
@@ -132,7 +133,7 @@ def survey(params: Params, digests: ContentDigests) -> Survey:
         except RecordingError as error:
             bad.append(BadEpisode(recording.source, recording.path, str(error)))
     if not episodes:
-        _refuse_bad(bad, of=len(bad))
+        _refuse_bad(bad, total=len(bad))
     spec, plan = _spec_and_plan(params, episodes, digests)
     return Survey(params, tuple(episodes), opened.missing, tuple(bad), spec, rotation, plan)
 
@@ -140,14 +141,14 @@ def survey(params: Params, digests: ContentDigests) -> Survey:
 def _spec_and_plan(
     params: Params, episodes: Sequence[SurveyedEpisode], digests: ContentDigests
 ) -> tuple[FeatureSpec, str]:
-    """The feature spec and the plan digest of a store of these episodes, which decide its views."""
+    """The feature spec and the plan digest of a store of these episodes."""
     data, extract = params.data, params.extract
     views = sorted({view for episode in episodes for view in episode.views})
     spec = feature_spec(params.vlm, extract.dtype, views, digests.of, digests.text)
     return spec, joint_digest(
         spec.digest,
         extract.sensor_dtype,
-        *(["rate"] if data.action_hz is None else []),  # which earlier stores did not keep
+        *(["rate"] if data.action_hz is None else []),  # earlier stores did not keep it
         repr([(source.name, source.action_kind) for source in data.sources]),
         *(episode.digest for episode in episodes),
     )
@@ -156,7 +157,7 @@ def _spec_and_plan(
 def sound_episodes(
     surveyed: Survey, digests: ContentDigests
 ) -> tuple[Survey, list[CheckedEpisode]]:
-    """Every sound episode, and the survey without those that have to be skipped.
+    """The survey without the episodes that must be skipped, and every sound episode.
 
     Raises as `check_episodes` does.
     """
@@ -169,8 +170,8 @@ def sound_episodes(
     sound = [episode for episode in surveyed.episodes if episode.digest not in unusable]
     spec, plan = _spec_and_plan(surveyed.params, sound, digests)
     bad = (*surveyed.bad, *(bad for _, bad in failed))
-    again = replace(surveyed, episodes=tuple(sound), bad=bad, spec=spec, plan=plan)
-    return again, [episode for episode in checked if episode.fields["digest"] not in unusable]
+    reduced = replace(surveyed, episodes=tuple(sound), bad=bad, spec=spec, plan=plan)
+    return reduced, [episode for episode in checked if episode.fields["digest"] not in unusable]
 
 
 def check_episodes(
@@ -178,9 +179,9 @@ def check_episodes(
 ) -> tuple[list[CheckedEpisode], list[tuple[SurveyedEpisode, BadEpisode]]]:
     """Read and check every episode; returns the sound ones, and the others with the reason.
 
-    Raises one `RecordingError` that lists all that cannot be used, unless
-    `data.on_bad_episode: skip` allows to leave them out, and `StoreMismatch` when two sources are
-    not of one embodiment, or have not one known rate where `data.action_hz` is null.
+    Raises one `RecordingError` that lists all unusable episodes, unless `data.on_bad_episode: skip`
+    leaves them out, and `StoreMismatch` when two sources have different embodiments, or when
+    `data.action_hz` is null and the episodes do not share one known rate.
     """
     preparer = Preparer(surveyed.params.vlm, surveyed.spec)
     sound: list[CheckedEpisode] = []
@@ -189,11 +190,11 @@ def check_episodes(
         try:
             sound.append(_checked(episode, surveyed, preparer))
         except RecordingError as error:
-            of = episode.recording
-            failed.append((episode, BadEpisode(of.source, of.path, str(error))))
+            recording = episode.recording
+            failed.append((episode, BadEpisode(recording.source, recording.path, str(error))))
     bad = [*surveyed.bad, *(bad for _, bad in failed)]
     if bad and (surveyed.params.data.on_bad_episode == "stop" or not sound):
-        _refuse_bad(bad, of=len(sound) + len(bad))
+        _refuse_bad(bad, total=len(sound) + len(bad))
     embodiment_of(sound)
     if surveyed.params.data.action_hz is None:
         _refuse_rates(sound)
@@ -201,7 +202,7 @@ def check_episodes(
 
 
 def embodiment_of(checked: Sequence[CheckedEpisode]) -> Embodiment:
-    """What all these episodes have in common; `StoreMismatch` where two sources differ."""
+    """The embodiment that all these episodes share; `StoreMismatch` where two sources differ."""
     return common_embodiment(
         [(episode.recording, episode.embodiment) for episode in checked],
         "store",
@@ -211,7 +212,7 @@ def embodiment_of(checked: Sequence[CheckedEpisode]) -> Embodiment:
 
 
 def _refuse_rates(checked: Sequence[CheckedEpisode]) -> None:
-    """Raise `StoreMismatch` where recorded rows, as ticks of one store, have no or two rates."""
+    """Raise `StoreMismatch` where the recorded rows have no rate, or more than one."""
     rates = sorted(
         (episode.ticks.recorded_hz, f"{episode.source!r} ({episode.recording.path})")
         for episode in checked
@@ -250,13 +251,13 @@ def _checked(episode: SurveyedEpisode, surveyed: Survey, preparer: Preparer) -> 
     return checked
 
 
-def _refuse_bad(bad: Sequence[BadEpisode], of: int) -> None:
+def _refuse_bad(bad: Sequence[BadEpisode], total: int) -> None:
     """Raise one `RecordingError` that lists the first bad episodes."""
     lines: list[str] = []
     for episode in bad:
         where = "" if str(episode.where) in episode.reason else f"{episode.where}: "
         lines.append(f"  {episode.source}: {where}{episode.reason}")
-    head = f"{len(bad)} of {of} episodes cannot be used:"
+    head = f"{len(bad)} of {total} episodes cannot be used:"
     mend = "Mend or remove them, or leave them out with --set data.on_bad_episode=skip."
     raise RecordingError("\n".join([head, *capped(lines, "episodes", MOST_EPISODES), mend]))
 
@@ -265,7 +266,7 @@ def _surveyed(
     recording: Recording, data: DataParams, rotation: ActionRotation, digests: ContentDigests
 ) -> SurveyedEpisode:
     path = absolute(recording.path)
-    with suppress(ValueError):  # a path below the data root is said from there: a store can move
+    with suppress(ValueError):  # relative to the data root where below it: a store can move
         path = path.relative_to(absolute(data.root))
     text = {
         "id": recording.id,
@@ -285,13 +286,13 @@ def _surveyed(
 
 
 _CONTENT_VERSION = 1
-"""To be raised whenever `content_digest` changes: results of before are remembered."""
+"""Raise it whenever `content_digest` changes, because earlier results are remembered."""
 
 
 def _content(recording: Recording, digests: ContentDigests) -> str:
     """The content digest of a recording, remembered by path, size and mtime of all its files.
 
-    One entry an episode: to look up each of its files would take longer than their `stat`.
+    There is one entry per episode: to look up each file would take longer than its `stat`.
     """
     listed = [str(_CONTENT_VERSION), recording.identity(), str(recording.path)]
     folders: dict[str, str] = {}
@@ -306,7 +307,7 @@ def _content(recording: Recording, digests: ContentDigests) -> str:
             what = f"{status.st_mode} {status.st_size} {status.st_mtime_ns}"
             listed.append(f"{what} {places[file]}")
     except OSError:
-        return content_digest(recording, digests.of)  # which names the file
+        return content_digest(recording, digests.of)  # its error names the file
 
     def of_place(file: Path) -> str:
         return digests.of(Path(places[str(file)]))

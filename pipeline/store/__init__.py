@@ -1,10 +1,10 @@
-"""The seam between the stages: a zarr store that is also a set of flat files.
+"""The store between the two stages: a zarr store that is also a set of flat files.
 
-`schema` says what is in it, `writer` builds it so that a kill loses nothing, `row_source` takes
-rows over from an older one, `reader` maps a finished one and gathers batches from it.
+`schema` defines what is in it, `writer` builds it so that a kill loses little, `row_source` takes
+rows from an older store, `reader` maps a finished store and gathers batches from it.
 
-`Batch` comes from `batch` when first asked for: it brings torch, which a store that is written,
-opened or checked does without.
+`Batch` is imported from `batch` on first use, because it imports torch, which is not needed to
+write, open or check a store.
 """
 
 from typing import TYPE_CHECKING, Any

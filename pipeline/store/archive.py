@@ -1,13 +1,14 @@
 """A compressed, sharded, checksummed copy of a store, for keeping and sharing.
 
-A plain zarr v3 group with the same arrays under the same names, but in few, large files (shards),
-in which inner chunks of some MB are compressed and checksummed one by one, so that a part can be
-read without the whole. A shard holds whole chunk files of the store: both copies are read and
-written once, in order, with one shard in memory at a time.
+It is a plain zarr v3 group with the same arrays under the same names, but in a few large files
+(shards). Inner chunks of some MB are compressed and checksummed one by one, so that a part can be
+read without the rest. A shard holds whole chunk files of the store, so that both copies are read
+and written once, in order, with one shard in memory at a time.
 
-Its root's attributes are those of the store and a manifest: the text of every `zarr.json` of the
-store, among them its seal with the checksum of each chunk file. That proves an archive and rebuilds
-the store to the byte. The manifest is written last: a folder that has one is a complete archive.
+Its root has the attributes of the store and a manifest: the text of every `zarr.json` of the store,
+including its seal with the checksum of each chunk file. The manifest proves the archive and is
+enough to rebuild every byte of the store. It is written last: a folder with a manifest is a
+complete archive.
 """
 
 import hashlib
@@ -79,18 +80,18 @@ _ZARR_JSON = "zarr.json"
 # The attribute of the root that holds the manifest.
 _MANIFEST = "archive"
 
-# Attributes of a store's root that would be false of an archive.
+# Attributes of a store's root that would be wrong in an archive.
 _OF_A_STORE = ("schema", "plan", METADATA_DIGEST, SEAL)
 
-# Raw bytes of a shard and of an inner chunk at most, where one chunk file of the store, or one row,
-# is not larger. Part of the format: an archive of other sizes has another `_SCHEMA`.
+# Most raw bytes of a shard and of an inner chunk, unless one chunk file of the store, or one row,
+# is larger. They are part of the format: to change them, change `_SCHEMA`.
 SHARD_BYTES = 256 * 2**20
 INNER_BYTES = 4 * 2**20
 
-# Where a shard says that a piece of zeros begins.
+# The offset that a shard's index gives for a piece of zeros, which is not stored.
 _NO_PIECE = 2**64 - 1
 
-# Names of files that a store can have: none climbs out of it.
+# The names that files of a store can have; none leads out of its folder.
 _ARRAY = rf"^({'|'.join(ARRAY_NAMES)})$"
 _VIEW = r"golden/[0-9]+/[^/.\x00][^/\x00]*"
 _FRAME = rf"^{_VIEW}/c/0/0/0$"
@@ -107,8 +108,9 @@ _Model = TypeVar("_Model")
 class ArchivedArray(Document):
     """One array in the manifest.
 
-    `raw_bytes` are those of its rows, `shard_bytes` the size of each shard's file: 0 where all is
-    zero, for which zarr writes no file. `metadata` is the digest of its metadata in the archive.
+    `raw_bytes` counts the bytes of its rows, `shard_bytes` those of each shard's file: 0 where all
+    values are zero, because zarr then writes no file. `metadata` is the digest of the array's
+    metadata in the archive.
     """
 
     codec: Text
@@ -120,8 +122,8 @@ class ArchivedArray(Document):
 class Manifest(Document):
     """The content of an archive.
 
-    `metadata` has the text of every `zarr.json` of the store by its path, `golden` the digest of
-    each chunk file of its golden rows, which are copied as they are.
+    `metadata` has the text of every `zarr.json` of the store by path. `golden` has the digest of
+    each chunk file of the golden rows, which are copied unchanged.
     """
 
     metadata: dict[Annotated[str, Field(pattern=_METADATA)], str]
@@ -151,17 +153,17 @@ class Manifest(Document):
 
     @property
     def raw_bytes(self) -> int:
-        """Of the rows of all arrays."""
+        """Bytes of the rows of all arrays."""
         return sum(array.raw_bytes for array in self.arrays.values())
 
     @property
     def stored_bytes(self) -> int:
-        """Of all shards."""
+        """Bytes of all shards."""
         return sum(sum(array.shard_bytes) for array in self.arrays.values())
 
 
 def is_archive(path: Path) -> bool:
-    """Whether a complete archive lies there; reads the group's metadata only."""
+    """Whether a complete archive lies at `path`; reads only the group's metadata."""
     return _manifest_document(path) is not None
 
 
@@ -193,14 +195,14 @@ def read_manifest(path: Path) -> Manifest:
 def archive(store: Path, output: Path, level: int, threads: int) -> Manifest | None:
     """Write the archive of a finished store to `output` and prove that it gives the store back.
 
-    `level` is zstd's, 1 to 22. The store is checked first, and every shard is read back once it is
-    written. The archive is written in `<output>.part`; after a kill it is begun anew. Returns None
-    where an archive of this very store is there already.
+    `level` is zstd's, 1 to 22. The store is checked first, and every shard is read back after it is
+    written. The archive is written in `<output>.part`; after a kill it starts again from nothing.
+    Returns None if `output` already is an archive of this store.
 
-    Raises `StoreIncomplete` naming the file where the store is not finished or is damaged,
+    Raises `StoreIncomplete`, which names the file, where the store is not finished or is damaged,
     `StoreMismatch` where something else lies at `output`, `StoreLocked` and `DiskFull`.
     """
-    opened = FeatureStore.open(store)  # says what is wrong with what is no finished store
+    opened = FeatureStore.open(store)  # its error says what is wrong with the store
     with build_lock(output):
         if output.exists():
             if is_archive(output) and _holds(read_manifest(output), store):
@@ -212,7 +214,7 @@ def archive(store: Path, output: Path, level: int, threads: int) -> Manifest | N
         refuse_foreign(output, ARCHIVE)  # a link to nothing
         check_trailers(store)
         read_golden(store, opened.array(KEYS))
-        with _begun(output, ARCHIVE, threads) as part:
+        with _new_part(output, ARCHIVE, threads) as part:
             manifest = _write(store, part, level, opened.attrs[SEAL])
         put_in_place(part, output, ARCHIVE)
         return manifest
@@ -221,12 +223,12 @@ def archive(store: Path, output: Path, level: int, threads: int) -> Manifest | N
 def restore(archive: Path, target: Path, threads: int) -> None:
     """Make the store of an archive again, equal in every byte of every file.
 
-    It is built in `<target>.part` like any store and renamed when complete; after a kill it is
-    begun anew. Where that very store is there already, nothing is done.
+    It is built in `<target>.part` like any store and renamed when complete; after a kill it starts
+    again from nothing. If `target` already is that store, nothing is done.
 
-    Raises `StoreIncomplete` naming file and array where the archive is damaged, `StoreMismatch`
-    where another store lies at `target` or is being built there, `ConfigError` where something
-    else lies there, `StoreLocked` and `DiskFull`.
+    Raises `StoreIncomplete`, which names file and array, where the archive is damaged,
+    `StoreMismatch` where another store lies at `target` or is being built there, `ConfigError`
+    where something else lies there, `StoreLocked` and `DiskFull`.
     """
     manifest = read_manifest(archive)
     with build_lock(target):
@@ -240,13 +242,13 @@ def restore(archive: Path, target: Path, threads: int) -> None:
             check_trailers(target)
             return
         _refuse_build(target)
-        with _begun(target, STORE, threads) as part:
+        with _new_part(target, STORE, threads) as part:
             _rebuild(manifest, archive, target, part)
 
 
 @contextmanager
-def _begun(target: Path, kind: OutputKind, threads: int) -> Generator[Path]:
-    """A new folder beside `target`, removed where what is done in it fails."""
+def _new_part(target: Path, kind: OutputKind, threads: int) -> Generator[Path]:
+    """A new folder beside `target`; it is removed if the work in it fails."""
     part = part_path(target)
     try:
         with disk_full_named(target), zarr.config.set({"async.concurrency": threads}):
@@ -258,7 +260,7 @@ def _begun(target: Path, kind: OutputKind, threads: int) -> Generator[Path]:
 
 
 def _write(store: Path, part: Path, level: int, seal: Seal) -> Manifest:
-    """Everything of an archive, its manifest last, all of it on the disk."""
+    """Write all of an archive to the disk, its manifest last."""
     inode, specs, metadata = inode_of(store), read_specs(store), _read_metadata(store)
     root = {k: v for k, v in group_attributes(store).items() if k not in _OF_A_STORE}
     for name in GROUPS:
@@ -283,7 +285,7 @@ def _write(store: Path, part: Path, level: int, seal: Seal) -> Manifest:
 def _write_array(
     store: Path, part: Path, spec: ArraySpec, level: int, seal: Seal, progress: "tqdm[Any]"
 ) -> ArchivedArray:
-    """Copy an array shard by shard; each is read back and compared with the seal."""
+    """Copy an array shard by shard; read each shard back and compare it with the seal."""
     array = _create_array(part, spec, level)
     sizes: list[int] = []
     for shard, rows in _shards(part, spec, array):
@@ -318,8 +320,8 @@ def _rebuild(manifest: Manifest, archive: Path, target: Path, part: Path) -> Non
         build.close()
         _copy_golden(archive, part, manifest.golden)
         sync_folders(part)
-        # With the root's attributes, which hold the plan, it is what an extraction would go on
-        # with, or an earlier one have left, and so nothing that another restoration may remove.
+        # The root's attributes hold the plan. With them the folder looks like an extraction's
+        # unfinished build, which no later restoration may remove; so they are written last.
         _write_metadata(part, {_ZARR_JSON: manifest.metadata[_ZARR_JSON]})
         sync(part / _ZARR_JSON)
         sync(part)
@@ -333,7 +335,7 @@ def _rebuild(manifest: Manifest, archive: Path, target: Path, part: Path) -> Non
 def _read_shard(
     array: "zarr.Array[Any]", spec: ArraySpec, shard: Path, rows: range, seal: Seal | None
 ) -> NDArray[Any]:
-    """The rows of a shard; raises `StoreIncomplete` where they are not those that were sealed."""
+    """The rows of a shard; raises `StoreIncomplete` where they differ from the sealed ones."""
     try:
         values = np.ascontiguousarray(array[rows.start : rows.stop])
     except (ValueError, RuntimeError) as error:
@@ -351,7 +353,7 @@ def _read_shard(
 
 def _create_array(root: Path | dict[str, Any], spec: ArraySpec, level: int) -> "zarr.Array[Any]":
     """The array in an archive, without data."""
-    # As few shards as can be, all but the last of one size.
+    # As few shards as possible; all but the last have the same size.
     most = max(1, SHARD_BYTES // max(1, spec.chunk_bytes))
     chunks = math.ceil(spec.chunk_count / max(1, math.ceil(spec.chunk_count / most))) or 1
     shard, inner = chunks * spec.chunk_rows, inner_rows(spec)
@@ -365,9 +367,9 @@ def _create_array(root: Path | dict[str, Any], spec: ArraySpec, level: int) -> "
 def codec_for(dtype: np.dtype[Any], chunk_bytes: int, level: int) -> BloscCodec:
     """The codec of inner chunks of `chunk_bytes`; `level` is zstd's, 1 to 22.
 
-    `python -m benchmarks.compression` holds the rule against other codecs: A-scans and features in
-    float32 and float16 are smallest with their bytes shuffled, clocks, row numbers and bfloat16
-    (as integers) with their bits. Blosc is given the whole chunk as one block: in blocks of its own
+    `python -m benchmarks.compression` compares this rule with other codecs: A-scans and features in
+    float32 and float16 are smallest with shuffled bytes; clocks, row numbers and bfloat16 (as
+    integers) with shuffled bits. Blosc gets the whole chunk as one block: in blocks of its own
     choice, features take a tenth more.
     """
     shuffle = BloscShuffle.shuffle
@@ -375,13 +377,13 @@ def codec_for(dtype: np.dtype[Any], chunk_bytes: int, level: int) -> BloscCodec:
         shuffle = BloscShuffle.noshuffle
     elif dtype.kind in "iu" or dtype.itemsize == 8:
         shuffle = BloscShuffle.bitshuffle
-    # Blosc numbers its levels 1 to 9 and runs zstd at 1, 3, 5, …, 15 and 22 for them.
+    # Blosc's levels 1 to 9 run zstd at levels 1, 3, 5, …, 15 and 22.
     clevel = 9 if level >= 22 else min(8, (level + 1) // 2)
     return BloscCodec(cname="zstd", clevel=clevel, shuffle=shuffle, blocksize=chunk_bytes)
 
 
 def inner_rows(spec: ArraySpec) -> int:
-    """Rows of an inner chunk: the most that divide a chunk of the store and are not too large."""
+    """Rows per inner chunk: the most that divide a store's chunk and fit `INNER_BYTES`."""
     parts = min(spec.chunk_rows, max(1, math.ceil(spec.chunk_bytes / INNER_BYTES)))
     return spec.chunk_rows // next(part for part in count(parts) if not spec.chunk_rows % part)
 
@@ -394,19 +396,19 @@ def _shards(root: Path, spec: ArraySpec, array: "zarr.Array[Any]") -> list[tuple
 
 
 def _open_array(archive: Path, spec: ArraySpec, record: ArchivedArray) -> "zarr.Array[Any]":
-    """An array of an archive; raises `StoreIncomplete` where its metadata are not as written."""
+    """An array of an archive; raises `StoreIncomplete` where its metadata were changed."""
     metadata = archive / spec.name / _ZARR_JSON
     if not metadata.is_file() or file_digest(metadata) != record.metadata:
         raise _damaged(metadata, f"missing, or not the metadata that were written of {spec.name}")
-    written: Any = _create_array({}, spec, level=1).metadata  # of any level: to unpack needs none
+    written: Any = _create_array({}, spec, level=1).metadata  # any level unpacks any other
     folder = StorePath(LocalStore(archive, read_only=True), spec.name)
     return zarr.Array(zarr.AsyncArray(written, folder))
 
 
 def _check_shard(shard: Path, array: "zarr.Array[Any]") -> None:
-    """Raise `StoreIncomplete` where a piece of a shard says that it unpacks to another size."""
+    """Raise `StoreIncomplete` where a piece of a shard claims another unpacked size."""
     if not shard.exists():
-        return  # of zeros
+        return  # all zero
     assert array.shards is not None, "an archive is sharded"
     whole = math.prod(array.chunks) * array.dtype.itemsize
     pieces = array.shards[0] // array.chunks[0]
@@ -416,7 +418,7 @@ def _check_shard(shard: Path, array: "zarr.Array[Any]") -> None:
         index = np.frombuffer(file.read(16 * pieces), "<u8", min(size, 16 * pieces) // 16 * 2)
         for begin, length in index.reshape(-1, 2).tolist():
             if begin < _NO_PIECE:
-                file.seek(min(begin, size) + 4)  # where Blosc says it
+                file.seek(min(begin, size) + 4)  # where Blosc keeps the unpacked size
                 if begin + length > size or int.from_bytes(file.read(4), "little") != whole:
                     raise _damaged(
                         shard, f"{array.path} cannot be read: a piece is not {whole} bytes"
@@ -424,12 +426,12 @@ def _check_shard(shard: Path, array: "zarr.Array[Any]") -> None:
 
 
 def _holds(manifest: Manifest, store: Path) -> bool:
-    """Whether an archive is of this store, by its metadata, which hold the seal."""
+    """Whether an archive is of this store: its metadata, with the seal, and golden rows agree."""
     return _read_metadata(store) == manifest.metadata and _golden_digests(store) == manifest.golden
 
 
 def _golden_digests(store: Path) -> dict[str, str]:
-    """The digest of each chunk file of a store's golden rows, by its path in it."""
+    """The digest of each chunk file of a store's golden rows, by path in the store."""
     paths = sorted(path for path in (store / GOLDEN).rglob("*") if path.is_file())
     names = {path.relative_to(store).as_posix(): path for path in paths}
     return {name: file_digest(path) for name, path in names.items() if re.fullmatch(_FRAME, name)}
@@ -438,7 +440,7 @@ def _golden_digests(store: Path) -> dict[str, str]:
 def _copy_golden(root: Path, to: Path, digests: Mapping[str, str]) -> None:
     """Copy the chunk files of golden rows.
 
-    Raises `StoreIncomplete` where one is missing or not the one that has its digest.
+    Raises `StoreIncomplete` where one is missing or does not give its digest.
     """
     for name in digests:
         (to / name).parent.mkdir(parents=True, exist_ok=True)
@@ -450,7 +452,7 @@ def _copy_golden(root: Path, to: Path, digests: Mapping[str, str]) -> None:
 
 
 def _refuse_build(target: Path) -> None:
-    """An unfinished extraction or repair may hold rows that exist nowhere else, of any plan."""
+    """Refuse an unfinished build of any plan: it may hold rows that exist nowhere else."""
     part = part_path(target)
     if unfinished_plans(target):
         raise StoreMismatch(
@@ -460,7 +462,7 @@ def _refuse_build(target: Path) -> None:
 
 
 def _read_metadata(store: Path) -> dict[str, str]:
-    """Every `zarr.json` of a store as text, by its path in it."""
+    """Every `zarr.json` of a store as text, by path in the store."""
     names = {path.relative_to(store).as_posix(): path for path in sorted(store.rglob(_ZARR_JSON))}
     known = {name: path for name, path in names.items() if re.fullmatch(_METADATA, name)}
     return {name: store_border(store).read_bytes(path).decode() for name, path in known.items()}
@@ -487,5 +489,5 @@ def _digest_of(body: Mapping[str, Any]) -> str:
 
 
 def _damaged(path: Path, why: str) -> PipelineError:
-    """The error for a file of an archive that is not as it was written."""
+    """The error for a changed or broken file of an archive."""
     return _BORDER.refusal(path, f"the archive is damaged: {why}")

@@ -15,8 +15,7 @@ from pipeline.base.observation import Observation
 class Batch(Observation):
     """What a policy sees at `batch` ticks, and the actions that it should answer.
 
-    A stream that the store lacks has width 0. Features and sensor have the dtype they are stored
-    in.
+    A stream that the store lacks has width 0. Features and sensor keep their stored dtype.
     """
 
     action: Float[Tensor, "batch horizon action_dim"]
@@ -31,21 +30,21 @@ class Batch(Observation):
         return len(self), self.action.shape[1], self.sensor.shape[1], self.state.shape[1]
 
     def to(self, device: torch.device | str, non_blocking: bool = False) -> Self:
-        """The batch on another device; fields that are no tensors stay as they are."""
-        return self._each(lambda tensor: tensor.to(device, non_blocking=non_blocking))
+        """The batch on another device; fields that are not tensors stay as they are."""
+        return self._mapped(lambda tensor: tensor.to(device, non_blocking=non_blocking))
 
     def pin(self) -> Self:
-        """The batch in page-locked memory, from where copies to a GPU are asynchronous.
+        """The batch in page-locked memory, from which copies to a GPU are asynchronous.
 
         Tensors on a device stay there.
         """
-        return self._each(lambda tensor: tensor.pin_memory() if tensor.is_cpu else tensor)
+        return self._mapped(lambda tensor: tensor.pin_memory() if tensor.is_cpu else tensor)
 
     def touch(self) -> Self:
-        """The batch itself, zeroed, so that every page of its memory exists before it is filled."""
-        return self._each(lambda tensor: tensor.zero_())
+        """Zero the batch in place, so that every page of its memory exists before it is filled."""
+        return self._mapped(lambda tensor: tensor.zero_())
 
-    def _each(self, change: Callable[[Tensor], Tensor]) -> Self:
+    def _mapped(self, change: Callable[[Tensor], Tensor]) -> Self:
         values = {field.name: getattr(self, field.name) for field in fields(self)}
         tensors = {name: value for name, value in values.items() if isinstance(value, Tensor)}
         return replace(self, **{name: change(value) for name, value in tensors.items()})

@@ -1,6 +1,7 @@
 """The documents of a store, of its arrays and of its episodes, as models.
 
-A store may come from anywhere: code behind this module asks no dictionary what it holds.
+A store may come from anywhere, so these models check it; the code behind them reads no raw
+dictionary.
 """
 
 from functools import lru_cache
@@ -32,7 +33,7 @@ class Group(Document):
 
 
 class ArrayDocument(Document):
-    """The entries of an array's `zarr.json` that decide all others."""
+    """The entries of an array's `zarr.json` that determine all others."""
 
     shape: list[Length]
     data_type: Text
@@ -45,7 +46,7 @@ _Pixels = Annotated[int, Field(ge=1, le=2**13)]
 
 
 class FrameDocument(Document):
-    """The `zarr.json` of a golden frame, which is one chunk."""
+    """The `zarr.json` of a golden frame, which is stored as one chunk."""
 
     shape: tuple[_Pixels, _Pixels, Literal[3]]
 
@@ -77,7 +78,8 @@ class StoredGolden(Document):
 class StoreAttributes(SourceDocument):
     """The root attributes of a store or a laid-out build; `raw` has all of them, unchanged.
 
-    `seal` has the trailers of each array's chunk files in order, in hex; a build has none yet.
+    `seal` has, for each array, the trailers of its chunk files in order, in hex; a build has none
+    yet.
     """
 
     raw: dict[str, Any]
@@ -93,6 +95,6 @@ class StoreAttributes(SourceDocument):
     def of(
         cls, root: Path, attributes: dict[str, Any], border: Border | None = None
     ) -> "StoreAttributes":
-        """Parse those of the store at `root`; raises `StoreIncomplete` naming a wrong entry."""
+        """Parse those of the store at `root`; raises `StoreIncomplete`, which names the entry."""
         entries = {**attributes, "raw": attributes}
         return (border or store_border(root)).parse(entries, cls, root / "zarr.json")

@@ -1,7 +1,7 @@
 """The chunk files of one array, written and read by row with plain system calls.
 
-Never through a map: a full disk must be an error of `pwrite`, a file that ends early one of this
-module, and neither a SIGBUS.
+A memory map is not used here: through a map, a full disk or a file that ends early would be a
+SIGBUS, but here both must be errors.
 """
 
 import errno
@@ -36,15 +36,15 @@ from pipeline.store.schema import (
 )
 
 Seal = Mapping[str, str]
-"""By array, the trailers of its chunk files in order, in hex."""
+"""For each array, the trailers of its chunk files in order, in hex."""
 UNSEALED = "expected a seal over metadata and chunks, found none: an earlier version wrote it"
 BLOCK_BYTES = 4 * 2**20
-"""Read at a time: it is still in the processor's cache when it is checked."""
+"""Bytes read at a time; few enough to be still in the processor's cache when they are checked."""
 _MOST_OPEN = 32
 
 
 def row_checksums(rows: NDArray[Any]) -> NDArray[np.uint32]:
-    """The crc32c of each row's bytes, (row,); a true 0 is kept as 1, for 0 says "not written"."""
+    """The crc32c of each row's bytes, (row,); a true 0 becomes 1, because 0 means "not written"."""
     flat = np.ascontiguousarray(rows).reshape(len(rows), -1).view(np.uint8)
     sums = np.fromiter((google_crc32c.value(row) for row in flat), np.uint32, len(flat))
     return np.where(sums == 0, np.uint32(1), sums)
@@ -67,9 +67,9 @@ def check_row_checksums(
 
 
 def trailers(root: Path, spec: ArraySpec) -> bytes:
-    """The trailers of an array's chunk files, in order; no other byte is read.
+    """The trailers of an array's chunk files, in order; reads no other byte.
 
-    Raises `StoreIncomplete` where a file is missing or has another size than it must.
+    Raises `StoreIncomplete` where a file is missing or has the wrong size.
     """
     border, wanted, read = store_border(root), spec.chunk_bytes + TRAILER_BYTES, b""
     for path in chunk_paths(root, spec):
@@ -81,16 +81,16 @@ def trailers(root: Path, spec: ArraySpec) -> bytes:
 
 
 def write_seal(root: Path, **attributes: Any) -> None:
-    """Write the seal of a store that is complete, and these attributes, into its root."""
+    """Write the seal of a complete store, and these attributes, into its root."""
     seal = {name: trailers(root, spec).hex() for name, spec in read_specs(root).items()}
     note_metadata(root, {**group_attributes(root), **attributes, SEAL: seal})
 
 
 def check_seal(root: Path, seal: Seal | None, specs: Mapping[str, ArraySpec]) -> None:
-    """Raise `StoreIncomplete` where metadata or a chunk file of a finished store are not those that
-    were sealed: changed, in another's place, of another store or of an older copy.
+    """Raise `StoreIncomplete` where metadata or a chunk file differ from what was sealed.
 
-    Reads metadata and trailers only. That a chunk gives its trailer, `check_trailers` proves.
+    A chunk file may be changed, or come from another place, another store or an older copy. Reads
+    only metadata and trailers; `check_trailers` also proves that each chunk gives its trailer.
     """
     border = store_border(root)
     if seal is None:
@@ -105,13 +105,13 @@ def check_seal(root: Path, seal: Seal | None, specs: Mapping[str, ArraySpec]) ->
 
 
 def sealed_trailer(seal: Seal | None, array: str, chunk: int) -> bytes | None:
-    """The trailer of a chunk file as it was sealed; None where nothing is sealed yet."""
+    """The sealed trailer of a chunk file; None where nothing is sealed yet."""
     digits = 2 * TRAILER_BYTES
     return None if seal is None else bytes.fromhex(seal.get(array, "")[chunk * digits :][:digits])
 
 
 def _unsealed(crc: bytes, sealed: bytes | None) -> str | None:
-    """What is wrong with a chunk file of this checksum where another was sealed."""
+    """What is wrong with a chunk file if its checksum `crc` is not the sealed one; else None."""
     if sealed in (None, crc):
         return None
     return (
@@ -121,10 +121,10 @@ def _unsealed(crc: bytes, sealed: bytes | None) -> str | None:
 
 
 def check_trailers(root: Path, but: Collection[str] = ()) -> None:
-    """Read a finished store once, every byte of it.
+    """Read every byte of a finished store once and compare it with its checksums.
 
-    The arrays named in `but` are left out. Raises `StoreIncomplete` where a chunk does not give the
-    checksum that was sealed, a feature row not its own, or the metadata not their digest.
+    The arrays named in `but` are left out. Raises `StoreIncomplete` where a chunk does not give its
+    sealed checksum, a feature row its own checksum, or the metadata their digest.
     """
     seal, specs = laid_out_attributes(root).seal, read_specs(root)
     check_seal(root, seal, specs)
@@ -132,7 +132,7 @@ def check_trailers(root: Path, but: Collection[str] = ()) -> None:
 
 
 def check_chunks(root: Path, specs: Iterable[ArraySpec], seal: Seal | None) -> None:
-    """Raise `StoreIncomplete` where a chunk of a finished store is not as it was written."""
+    """Raise `StoreIncomplete` where a chunk of a finished store changed since it was written."""
     if damage := find_damage(root, specs, seal):
         raise StoreIncomplete(
             f"{damage}, so that nothing can be taken from this store. {mend(root)}"
@@ -140,10 +140,10 @@ def check_chunks(root: Path, specs: Iterable[ArraySpec], seal: Seal | None) -> N
 
 
 def find_damage(root: Path, specs: Iterable[ArraySpec], seal: Seal | None = None) -> str | None:
-    """The first chunk file of these arrays that does not give its trailer or the one in the seal,
-    and what is wrong. Raises `StoreIncomplete` where a feature row does not give its checksum.
+    """The first chunk file that does not give its trailer or its sealed one, and what is wrong.
 
-    With a bar on a terminal where it takes longer than a second.
+    Raises `StoreIncomplete` where a feature row does not give its checksum. Shows a progress bar on
+    a terminal after one second.
     """
     files = [(spec, chunk) for spec in specs for chunk in range(spec.chunk_count)]
     own = read_spec(root, CHECKSUMS) if any(spec.name == FEATURES for spec, _ in files) else None
@@ -160,7 +160,7 @@ def find_damage(root: Path, specs: Iterable[ArraySpec], seal: Seal | None = None
 def _compare_rows(
     root: Path, own: ArraySpec, spec: ArraySpec, chunk: int, first: int, rows: NDArray[Any]
 ) -> None:
-    """Raise `StoreIncomplete` where feature rows of a chunk do not give `own`, their checksums."""
+    """Raise `StoreIncomplete` where feature rows do not give the checksums in array `own`."""
     within = spec.chunk_rows_of(chunk)[first : first + len(rows)]
     if within:  # the rest is padding
         wanted = read_rows(root, own, within.start, within.stop)
@@ -168,14 +168,14 @@ def _compare_rows(
 
 
 def read_rows(root: Path, spec: ArraySpec, start: int = 0, stop: int | None = None) -> NDArray[Any]:
-    """Rows start..stop - 1 of an array of a store or a build, or all, as they are on disk.
+    """Rows start..stop - 1 (by default all) of an array of a store or a build, from disk.
 
     Raises `StoreIncomplete` where a chunk file is missing or ends before them.
     """
     stop = spec.shape[0] if stop is None else stop
     border = store_border(root)
     chunks = range(start // spec.chunk_rows, -(-stop // spec.chunk_rows))
-    for chunk in chunks if spec.row_bytes else ():  # before memory is taken for what is not there
+    for chunk in chunks if spec.row_bytes else ():  # before allocating memory
         border.check_file(chunk_path(root, spec, chunk))
     rows = np.zeros((stop - start, *spec.shape[1:]), spec.dtype)
     for chunk, offset, data in _parts(spec, start, rows):
@@ -189,14 +189,14 @@ def read_rows(root: Path, spec: ArraySpec, start: int = 0, stop: int | None = No
 
 @dataclass(frozen=True)
 class ChunkState:
-    """How a chunk file is, read once from end to end."""
+    """The state of a chunk file that was read once from end to end."""
 
     bytes: int
-    """That could be read, of rows and trailer."""
+    """Bytes of rows and trailer that could be read."""
     crc: int
-    """The crc32c of the rows, those of padding among them."""
+    """The crc32c of the rows, including padding."""
     damage: str | None
-    """Expected and found; None where the file gives its trailer."""
+    """What was expected and found; None where the file gives its trailer."""
 
 
 def _pass(first: int, rows: NDArray[Any]) -> None:
@@ -211,8 +211,8 @@ def read_chunk(
 ) -> ChunkState:
     """Read a chunk file block by block and compare it with its trailer, and with the `sealed` one.
 
-    `visit` is given each block's first row within the chunk and its whole rows, which are valid
-    until the next block.
+    `visit` gets each block's first row within the chunk and the block's complete rows, which are
+    valid only until the next block.
     """
     together = max(1, min(spec.chunk_rows, BLOCK_BYTES // spec.row_bytes))
     buffer = np.empty(together * spec.row_bytes, np.uint8)
@@ -247,8 +247,8 @@ def read_chunk(
 class ChunkFiles:
     """The files of one array of a build, written by row.
 
-    A linked chunk belongs to another store too: `write` skips it, or copies it first when the array
-    is `owned`. Rows of an `owned` array have checksums of their own, which the caller compares.
+    A linked chunk also belongs to another store: `write` skips it, or copies it first when the
+    array is `owned`. Rows of an `owned` array have their own checksums, which the caller compares.
     """
 
     def __init__(self, root: Path, spec: ArraySpec, *, owned: bool = False) -> None:
@@ -281,7 +281,7 @@ class ChunkFiles:
         """Take a chunk over from another store as it is; False where files cannot be linked."""
         self.paths[chunk].parent.mkdir(parents=True, exist_ok=True)
         try:
-            # A cache may hand its files out as symbolic links: the file itself has to be shared.
+            # The path may be a cache's symbolic link; link the file behind it.
             os.link(source.resolve(), self.paths[chunk])
         except OSError as error:
             if error.errno not in (errno.EXDEV, errno.EPERM, errno.EMLINK, errno.EOPNOTSUPP):
@@ -304,26 +304,26 @@ class ChunkFiles:
             with disk_full_named(self.paths[chunk]):
                 descriptor = self._descriptor(chunk)
                 if os.fstat(descriptor).st_size > self.spec.chunk_bytes:
-                    os.ftruncate(descriptor, self.spec.chunk_bytes)  # a trailer of other rows
+                    os.ftruncate(descriptor, self.spec.chunk_bytes)  # drop the old trailer
                 _write_all(descriptor, data.data, offset)
             self._sum_up(chunk, offset, data)
             self._unsynced.add(chunk)
 
     def read(self, start: int, count: int) -> NDArray[Any]:
-        """Consecutive rows as they are on disk, of whatever process or host wrote them."""
+        """Consecutive rows from disk, whichever process or host wrote them."""
         return read_rows(self._root, self.spec, start, start + count)
 
     def sync(self) -> None:
-        """Return once everything written has reached the disk."""
+        """Wait until everything written has reached the disk."""
         for chunk in self._unsynced:
             with disk_full_named(self.paths[chunk]):
                 os.fdatasync(self._descriptor(chunk))
         self._unsynced.clear()
 
     def write_trailers(self) -> None:
-        """Write each chunk's trailer, of the rows as they were handed in; rows left out are zero.
+        """Write each chunk's trailer, computed from the rows given to `write`; others are zero.
 
-        For arrays that were written here from their first row on. Waits for the disk.
+        Only for arrays that were written here in order from their first row. Waits for the disk.
         """
         for chunk in range(len(self.paths)):
             if not self.is_linked(chunk):
@@ -336,16 +336,16 @@ class ChunkFiles:
     def seal(self) -> None:
         """Compare each chunk with its trailer, or write it where there is none yet.
 
-        Running it again changes nothing. A trailer that is not that of the rows is written again
-        where they are `owned`: after a power loss a file may have its size without its end. Else
-        raises `StoreIncomplete`.
+        A second run changes nothing. A trailer that does not match the rows is written again if the
+        array is `owned`, because after a power loss a file may have its full size without its last
+        bytes. Otherwise raises `StoreIncomplete`.
         """
         sealed = self.spec.chunk_bytes + TRAILER_BYTES
         for chunk, path in enumerate(self.paths):
             if self.is_linked(chunk):
                 if path.stat().st_size == sealed:
                     continue
-                self._unlink(chunk)  # its other name is no store's: a copy of the build, say
+                self._unlink(chunk)  # unsealed, so its other name is not a store's
             state = read_chunk(path, self.spec)
             if state.damage:
                 whole = state.bytes >= self.spec.chunk_bytes
@@ -362,7 +362,7 @@ class ChunkFiles:
         self._descriptors.clear()
 
     def _sum_up(self, chunk: int, offset: int, data: NDArray[np.uint8]) -> None:
-        """Go on with the checksum of a chunk that is written in order; -1 says that it was not."""
+        """Extend the checksum of a chunk written in order; -1 marks one that was not."""
         done, crc = self._sums.get(chunk, (0, 0))
         in_order = offset == done
         crc = google_crc32c.extend(crc, data) if in_order else 0
@@ -375,7 +375,7 @@ class ChunkFiles:
         self._unsynced.add(chunk)
 
     def _unlink(self, chunk: int) -> None:
-        """Put a copy in the place of a linked file."""
+        """Replace a linked file with a copy of it."""
         self.close()
         path = self.paths[chunk]
         copy = path.with_name(path.name + ".partial")

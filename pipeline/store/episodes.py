@@ -1,6 +1,6 @@
-"""Episodes one behind the other: the arrays of a store that need no model and no stream.
+"""Episodes one after the other: the arrays of a store that need no model and no stream.
 
-`episode_arrays` makes them, `read_episodes` says what they hold.
+`episode_arrays` makes them, `read_episodes` reads them.
 """
 
 import json
@@ -18,7 +18,7 @@ from pipeline.store.border import EpisodeText, store_border
 from pipeline.store.schema import POSITIONS, STREAMS
 
 FIELDS = tuple(name for name in EpisodeText.model_fields if name != "group")
-"""The entries of an episode in `episode/text`; `group` stands there too where it is known."""
+"""The entries of an episode in `episode/text`; `group` is there too if it is known."""
 
 
 @dataclass(frozen=True)
@@ -34,13 +34,13 @@ class Episode:
     content: str
     """Digest of its files."""
     digest: str
-    """Digest of its content and of everything else that decides its rows."""
+    """Digest of the content and of everything else that decides its rows."""
     ticks: range
     vl_rows: range
     readings: range
     states: range
     group: str | None = None
-    """Of the episodes that the recordings say belong together; None where this one says nothing."""
+    """Name shared by episodes that belong together; None where the recording gives none."""
 
     @property
     def text(self) -> bytes:
@@ -62,7 +62,7 @@ def _text(fields: Mapping[str, str]) -> bytes:
 def read_texts(root: Path, arrays: Mapping[str, NDArray[Any]]) -> list[EpisodeText]:
     """The texts of all episodes, in order.
 
-    Raises `StoreIncomplete` naming the episode whose text is broken.
+    Raises `StoreIncomplete`, which names the episode whose text is broken.
     """
     text, border = arrays["episode/text"].tobytes(), store_border(root)
     return [
@@ -72,7 +72,7 @@ def read_texts(root: Path, arrays: Mapping[str, NDArray[Any]]) -> list[EpisodeTe
 
 
 def check_index(root: Path, arrays: Mapping[str, NDArray[Any]], rows: Mapping[str, int]) -> None:
-    """Raise `StoreIncomplete` where the episodes do not share out the `rows` of each stream."""
+    """Raise `StoreIncomplete` where the episodes do not divide the `rows` of each stream."""
     for stream, count in rows.items():
         name = f"episode/{stream}_start"
         edges = arrays[name]
@@ -83,16 +83,16 @@ def check_index(root: Path, arrays: Mapping[str, NDArray[Any]], rows: Mapping[st
 
 
 def check_positions(root: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
-    """Raise `StoreIncomplete` where a tick points at a row of another episode, or at none."""
+    """Raise `StoreIncomplete` where a tick points at a row outside its episode."""
     starts = arrays["episode/tick_start"]
-    having = np.flatnonzero(starts[1:] > starts[:-1])
-    for name, stream in POSITIONS.items() if len(having) else ():
-        low = np.minimum.reduceat(arrays[name], starts[having])
-        high = np.maximum.reduceat(arrays[name], starts[having])
+    episodes = np.flatnonzero(starts[1:] > starts[:-1])
+    for name, stream in POSITIONS.items() if len(episodes) else ():
+        low = np.minimum.reduceat(arrays[name], starts[episodes])
+        high = np.maximum.reduceat(arrays[name], starts[episodes])
         edges = arrays[f"episode/{stream}_start"]
-        begin, end = edges[having], edges[having + 1] - (name == "tick/vl_row")
+        begin, end = edges[episodes], edges[episodes + 1] - (name == "tick/vl_row")
         for at in np.flatnonzero((low < begin) | (high > end))[:1]:
-            what = f"expected positions from {begin[at]} to {end[at]} in episode {having[at]}"
+            what = f"expected positions from {begin[at]} to {end[at]} in episode {episodes[at]}"
             found = f"{low[at]} to {high[at]}"
             raise store_border(root).refusal(root / name, f"{what}, found {found}")
 
@@ -100,9 +100,9 @@ def check_positions(root: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
 def read_episodes(
     root: Path, arrays: Mapping[str, NDArray[Any]], sources: Sequence[str]
 ) -> tuple[Episode, ...]:
-    """All episodes of a store with these arrays, in order; `sources` as `episode/source` counts.
+    """All episodes of a store with these arrays, in order; `episode/source` indexes `sources`.
 
-    Raises `StoreIncomplete` where one has no text, or a source that is none of these.
+    Raises `StoreIncomplete` where an episode's text is broken, or its source is not one of these.
     """
     source_of = arrays["episode/source"]
     if ((source_of < 0) | (source_of >= len(sources))).any():
@@ -131,13 +131,13 @@ class EpisodeRows:
     """How many rows of each stream an episode has, and its entries in `episode/text`."""
 
     ticks: Any
-    """A `pipeline.data.timeline.Timeline`, or what says the same: ticks with indices into the
-    episode's own streams."""
+    """A `pipeline.data.timeline.Timeline`, or an object with the same fields: ticks with indices
+    into the episode's own streams."""
     readings: int
     states: int
     source: str
     fields: Mapping[str, str]
-    """The fields named in `FIELDS`, and `group` where the recording names one."""
+    """The entries in `FIELDS`, and `group` where the recording names one."""
 
     @property
     def text(self) -> bytes:
@@ -154,7 +154,7 @@ class EpisodeRows:
 def index_arrays(
     episodes: Sequence[Episode | EpisodeRows], sources: Sequence[str]
 ) -> dict[str, NDArray[Any]]:
-    """Everything under `episode/`; the rows of these episodes stand one behind the other."""
+    """All arrays under `episode/`; the rows of these episodes follow one another."""
     counts = [episode.counts for episode in episodes]
     arrays: dict[str, NDArray[Any]] = {
         f"episode/{stream}_start": np.cumsum([0, *(count[stream] for count in counts)])
@@ -169,7 +169,7 @@ def index_arrays(
 def episode_arrays(
     episodes: Sequence[EpisodeRows], sources: Sequence[str], views: Sequence[str]
 ) -> dict[str, NDArray[Any]]:
-    """Everything under `tick/` and `episode/`, and the times under `vl/`; indices store-global."""
+    """All arrays of `tick/` and `episode/`, and the times of `vl/`; with store-global indices."""
     arrays = index_arrays(episodes, sources)
     ticks = [episode.ticks for episode in episodes]
     for stream, stored in STREAMS.items():

@@ -1,7 +1,7 @@
-"""Gather windows and rows out of flat maps into reused buffers.
+"""Gather windows and rows from flat maps into reused buffers.
 
-Arithmetic on whole batches of indices, then one `index_select` a stream into its buffer, which runs
-at the speed of a row gather in C; no sample is touched from Python.
+Indices are computed for whole batches; then one `index_select` per stream fills its buffer at the
+speed of a row gather in C. No Python code runs per sample.
 """
 
 from collections.abc import Collection, Mapping
@@ -25,21 +25,21 @@ WIDE = {
     "state": "state/values",
     "sensor": "sensor/values",
 }
-"""The fields of a batch that are copied out of an array as wide as they are, and that array."""
+"""The fields of a batch that are copied row by row from an array, and that array's name."""
 _BLOCK_ELEMENTS = 32768
-"""Most elements of a block of readings that is copied at once: beyond it, torch divides each block
-among its threads in turn instead of dividing the blocks among them, and copies more slowly."""
+"""Most elements of a block of readings that is copied at once. With larger blocks torch splits each
+block over its threads, instead of giving each thread its own blocks, and is slower."""
 _CACHE_LINE = 64
 
 Index = NDArray[np.int64]
 Late = int | float | NDArray[Any]
-"""How late a stream is: for all samples of a batch, or (batch,)."""
+"""How late a stream is: one number for all samples of a batch, or (batch,)."""
 
 
 @dataclass(frozen=True, eq=False)
 class Window:
-    """Which readings each sample of a batch sees: the `valid` (batch,) ones before `end` (batch,),
-    right-aligned in a window that is never shorter."""
+    """Which readings each sample of a batch sees: the last `valid` (batch,) readings before index
+    `end` (batch,), right-aligned in a window of at least that length."""
 
     end: Index
     valid: Index
@@ -47,7 +47,7 @@ class Window:
 
 @dataclass(frozen=True, eq=False)
 class Selection:
-    """Where the wide fields of a batch lie in their arrays, as `Gatherer.tensor` shows them."""
+    """Where the wide fields of a batch lie in the tensors of `Gatherer.tensor`."""
 
     rows: Mapping[str, Index]
     """`features` (batch,) and `action` (batch x horizon,)."""
@@ -58,7 +58,7 @@ class Selection:
 class Gatherer:
     """Fills batches from the arrays of one store, given by name.
 
-    Each VL row holds its slots once a variant, variant after variant.
+    Each VL row holds its slots once per variant, one variant after the other.
     """
 
     def __init__(self, arrays: Mapping[str, NDArray[Any]], variants: int) -> None:
@@ -67,7 +67,7 @@ class Gatherer:
         self._tensors: dict[str, Tensor] = {}
         wide = {name: arrays[array] for name, array in WIDE.items()}
         self.in_memory = fitting({name: a.nbytes for name, a in wide.items()}, available_bytes())
-        """The wide fields whose arrays fit in memory together, the smallest first."""
+        """The wide fields whose arrays fit in memory together, smallest first."""
         for name in wide.keys() - {*self.in_memory}:
             read_at_random(wide[name])
 
@@ -81,9 +81,9 @@ class Gatherer:
         variant: Index | None,
         oldest_s: Mapping[str, float | None],
     ) -> Selection:
-        """Fill all but the wide fields of `batch`, and say where those lie.
+        """Fill the fields of `batch` that are not wide; return where the wide ones lie.
 
-        `oldest_s` has the seconds that the window of `sensor` and `state` reaches back. See
+        `oldest_s` says how many seconds the windows of `sensor` and `state` reach back. See
         `FeatureStore.gather`.
         """
         episode = episode_of(self._arrays, tick)
@@ -99,7 +99,7 @@ class Gatherer:
         )
 
     def copy(self, selection: Selection, batch: Batch, but: Collection[str] = ()) -> None:
-        """Fill the wide fields of `batch`; those named in `but` stay as they are."""
+        """Fill the wide fields of `batch`, except those named in `but`."""
         for name, rows in selection.rows.items():
             if name not in but:
                 self._expect(name, rows, 1)
@@ -120,7 +120,7 @@ class Gatherer:
         state_window: int,
         but: Collection[str] = (),
     ) -> Batch:
-        """Buffers for `gather(..., out=)`; those named in `but` have a shape, but no memory."""
+        """Buffers for `gather(..., out=)`; fields named in `but` have a shape but no memory."""
 
         def wide(name: str, *shape: int) -> Tensor:
             like = self.tensor(name)
@@ -145,7 +145,7 @@ class Gatherer:
         )
 
     def tensor(self, name: str) -> Tensor:
-        """The map that a wide field is gathered from; of the features, (vl_row x variant, …)."""
+        """The map of a wide field; for the features, (vl_row x variant, slot, dim)."""
         if name not in self._tensors:
             array = self._arrays[WIDE[name]]
             tensor = torch.from_numpy(array)
@@ -156,20 +156,20 @@ class Gatherer:
         return self._tensors[name]
 
     def feature_age(self, tick: Index, row: Index) -> NDArray[np.float64]:
-        """(tick,) s since the newest frame of the VL row of each tick; since the row's own tick
-        where it has no frame at all."""
-        shown = self._arrays["vl/frame_time"][row]
-        newest = np.fmax.reduce(shown, axis=1, initial=-np.inf)
+        """(tick,) seconds since the newest frame of each tick's VL row, or since the row's own tick
+        if it has no frame."""
+        frame_times = self._arrays["vl/frame_time"][row]
+        newest = np.fmax.reduce(frame_times, axis=1, initial=-np.inf)
         newest = np.where(np.isfinite(newest), newest, self._arrays["vl/time"][row])
         return self._arrays["tick/time"][tick] - newest
 
     def vl_rows(self, tick: Index, episode: Index, lag: Late = 0) -> Index:
-        """(tick,) the VL row of each tick, `lag` rows back, not beyond the episode's first."""
+        """(tick,) the VL row of each tick, `lag` rows back, but not before the episode's first."""
         row = self._arrays["tick/vl_row"][tick]
         return np.maximum(row - lag, self._arrays["episode/vl_start"][episode])
 
     def populate(self, but: Collection[str]) -> None:
-        """Read the wide fields that fit in memory into it, one by one, without those in `but`."""
+        """Read the wide fields that fit in memory, one by one, except those in `but`."""
         for name in self.in_memory:
             if name not in but:
                 populate(self._arrays[WIDE[name]])
@@ -229,7 +229,7 @@ class Gatherer:
         return np.minimum(index, stop - 1).ravel()
 
     def _expect(self, name: str, first: Index, rows: int) -> None:
-        """Have the disk read what is about to be copied from a map that memory has no room for."""
+        """Start to read these rows from the disk if their map does not fit in memory."""
         if name not in self.in_memory:
             variants = self._variants if name == "features" else 1
             will_need(self._arrays[WIDE[name]], first // variants, rows)
@@ -239,7 +239,7 @@ def copy_windows(readings: Tensor, window: Window, out: Tensor) -> None:
     """Fill `out` (batch, window, channel) from `readings` (reading, channel), zeros on the left."""
     batch, length, channels = out.shape
     if len(window.end) and len(readings) and window.end.min() >= length:
-        # Overlapping blocks of readings, one beginning at each: few, long copies.
+        # Overlapping blocks, one per first reading, so that there are few, long copies.
         block = _block(length, channels)
         blocks = readings.as_strided((len(readings) - block + 1, block * channels), (channels, 1))
         index = window.end[:, None] + np.arange(-length, 0, block)
@@ -250,12 +250,12 @@ def copy_windows(readings: Tensor, window: Window, out: Tensor) -> None:
         flat = out.view(-1, channels)
         torch.index_select(readings, 0, torch.from_numpy(index.ravel()), out=flat)
     if len(window.valid) and window.valid.min() < length:
-        before = np.flatnonzero(np.arange(length) < length - window.valid[:, None])
-        out.view(batch * length, channels).index_fill_(0, torch.from_numpy(before), 0)
+        padding = np.flatnonzero(np.arange(length) < length - window.valid[:, None])
+        out.view(batch * length, channels).index_fill_(0, torch.from_numpy(padding), 0)
 
 
 def _block(length: int, channels: int) -> int:
-    """The most readings a copy, so that whole copies make a window of `length`."""
+    """Readings per copy: the most that divide a window of `length` and are few enough."""
     most = max(1, _BLOCK_ELEMENTS // channels)
     return next(size for size in range(min(length, most), 0, -1) if length % size == 0)
 
@@ -265,19 +265,18 @@ def _first_after(
 ) -> Index:
     """For each sample, the first reading in low..high - 1 later than its instant, else `high`.
 
-    Bisection of all samples at a time: each has a stretch of the clock of its own, within which
-    alone the clock ascends.
+    Bisects all samples at once: the clock ascends only within each sample's own range.
     """
     while (searching := low < high).any():
         middle = (low + high) // 2
-        seen = clock[np.where(searching, middle, 0)] <= instant
-        low = np.where(searching & seen, middle + 1, low)
-        high = np.where(searching & ~seen, middle, high)
+        reached = clock[np.where(searching, middle, 0)] <= instant
+        low = np.where(searching & reached, middle + 1, low)
+        high = np.where(searching & ~reached, middle, high)
     return low
 
 
 def _buffer(shape: tuple[int, ...], dtype: torch.dtype) -> Tensor:
-    """Uninitialised memory; numpy asks the kernel for huge pages for it, which torch does not."""
+    """Uninitialised memory from numpy, which, unlike torch, asks the kernel for huge pages."""
     size = int(np.prod(shape)) * dtype.itemsize
     raw = np.empty(size + _CACHE_LINE, np.uint8)
     begin = -raw.ctypes.data % _CACHE_LINE

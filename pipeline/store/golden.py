@@ -1,8 +1,8 @@
 """Golden rows in a store: the group `golden`, beside the arrays that training maps.
 
-`golden/<n>/<view>` are decoded frames, compressed, as plain zarr reads them; the root's attribute
-`golden` has the row, the rendered prompt and the views of each n. They prove themselves: frames and
-prompt give the key of their row. A store of an earlier version has none.
+`golden/<n>/<view>` is a decoded frame, compressed, in plain zarr; the root's attribute `golden` has
+the row, the rendered prompt and the views of each n. Each golden row can be checked: its frames and
+prompt give the key of its row. A store of an earlier version has none.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -42,12 +42,12 @@ class GoldenFrames:
     frames: Mapping[str, NDArray[np.uint8]]
 
     def key(self, spec: Mapping[str, Any]) -> bytes:
-        """The key that these frames and this prompt give under a feature spec."""
+        """The key of these frames and this prompt under a feature spec."""
         return row_key(spec["digest"], spec.get("views", ()), self.prompt, self.frames)
 
 
 def write_golden(root: Path, rows: Sequence[GoldenFrames]) -> None:
-    """Write these golden rows into a build, in place of earlier ones. Raises `DiskFull`."""
+    """Write these golden rows into a build and replace earlier ones. Raises `DiskFull`."""
     with disk_full_named(root):
         zarr.create_group(root, path=GOLDEN, overwrite=True)
         for number, golden in enumerate(rows):
@@ -63,7 +63,7 @@ def write_golden(root: Path, rows: Sequence[GoldenFrames]) -> None:
 def read_golden(root: Path, keys: NDArray[np.uint8]) -> list[GoldenFrames]:
     """The golden rows of a store whose rows have these keys.
 
-    Raises `StoreIncomplete` naming the one that cannot be read or does not give its key.
+    Raises `StoreIncomplete`, which names the row that cannot be read or does not give its key.
     """
     attributes = laid_out_attributes(root)
     entries = enumerate(attributes.golden)
@@ -73,9 +73,9 @@ def read_golden(root: Path, keys: NDArray[np.uint8]) -> list[GoldenFrames]:
 def carried_golden(
     root: Path, spec: Mapping[str, Any], keys: NDArray[np.uint8]
 ) -> Iterator[GoldenFrames]:
-    """The golden rows of a store that a build of this spec and these `keys` (row, 16) has, too.
+    """The golden rows of a store that a build with this spec and these `keys` (row, 16) also has.
 
-    Each gets the number of the first row of its key in the build. Damaged ones are left out.
+    Each gets the number of the build's first row with its key. Damaged ones are left out.
     """
     try:
         check_metadata(root)
@@ -93,7 +93,7 @@ def carried_golden(
 def golden_issues(
     root: Path, attributes: StoreAttributes, keys: ArraySpec | None
 ) -> Iterator[Issue]:
-    """The damage of golden rows; none is found where the keys cannot be read."""
+    """The damage of golden rows; nothing is checked where the keys cannot be read."""
     if keys is None:
         return
     for number, entry in enumerate(attributes.golden):
@@ -154,7 +154,7 @@ def _unproven(root: Path, number: int, entry: StoredGolden) -> GoldenFrames:
 
 
 def _read_frame(root: Path, place: Path) -> NDArray[np.uint8]:
-    """A frame (height, width, 3) that `_write_frame` wrote; never unpacks more than its shape."""
+    """A frame (height, width, 3) of `_write_frame`; never unpacks more bytes than its shape has."""
     border = store_border(root)
     document = border.read_json(place / "zarr.json", FrameDocument)
     frame = np.zeros(document.shape, np.uint8)

@@ -1,9 +1,10 @@
-"""What lies in a folder of stores: as a table for people, and what of it may be removed.
+"""What is in a folder of stores, as a table for people, and which of it may be removed.
 
-Metadata and a few small arrays are read, whatever the size. A damaged store is listed with the
-reason and stops nothing. Never removed: a finished store or its only copy, an archive, what a
-living process is building, what this project did not write, what lies behind a symbolic link. What
-holds feature rows is removed only by name: the next run resumes it or takes its rows over.
+Only metadata and a few small arrays are read, whatever the size. A damaged store is listed with the
+reason and does not stop the list. Never removed are a finished store or its only copy, an archive,
+a build of a living process, anything that this project did not write, and anything behind a
+symbolic link. A build with feature rows is removed only by name, because the next run resumes it or
+takes its rows.
 """
 
 import re
@@ -42,7 +43,7 @@ from pipeline.store.schema import CHECKSUMS, FEATURES, ArraySpec, read_spec, rea
 
 Fate = Literal["unneeded", "by name", "kept"]
 
-# What lies there, by what its name has behind that of a store.
+# The kind of an entry, by the suffix after the store's name.
 _KINDS = {
     None: "store",
     ".part": "build",
@@ -57,11 +58,11 @@ _SPEC_ENTRIES = ("processor", "weights", "adapter", "compute_dtype", "variants",
 
 @dataclass(frozen=True)
 class StoreEntry:
-    """A store, an archive, or what lies beside the store `base` and belongs to it.
+    """A store, an archive, or something beside the store `base` that belongs to it.
 
-    `bytes` are those on the disk. Stores, archives and builds have `attributes` and `specs`; `done`
-    of their feature rows are there. `damage` is the reason why one cannot be used, `holder` the
-    living process that has the lock of `base`.
+    `bytes` is its size on the disk. Stores, archives and builds have `attributes` and `specs`;
+    `done` counts the feature rows that are there. `damage` is the reason why an entry cannot be
+    used, `holder` the living process that holds the lock of `base`.
     """
 
     path: Path
@@ -76,7 +77,7 @@ class StoreEntry:
 
 
 def list_stores(folder: Path, *, subfolders: bool = True) -> list[StoreEntry]:
-    """Everything in `folder` and its subfolders that belongs to a store, by path.
+    """Everything in `folder` and its subfolders that belongs to a store, sorted by path.
 
     Raises `ConfigError` where there is no such folder.
     """
@@ -91,24 +92,24 @@ def list_stores(folder: Path, *, subfolders: bool = True) -> list[StoreEntry]:
 def describe_stores(
     folder: Path, entries: Sequence[StoreEntry], dependents: Mapping[Path, Sequence[str]]
 ) -> list[str]:
-    """Lines for people: a table, below each store its `dependents`, then the feature specs."""
-    shown = [entry for entry in entries if entry.kind != "lock"]
-    if not shown:
+    """Lines for people: a table with the `dependents` below each store, then the feature specs."""
+    listed = [entry for entry in entries if entry.kind != "lock"]
+    if not listed:
         return [f"{folder}: no store in it"]
     heads = ("", "what", "on disk", "episodes", "ticks", "VL rows", "spec")
-    header, *rows = Table(heads, [_row(folder, entry) for entry in shown]).text()
+    header, *rows = Table(heads, [_row(folder, entry) for entry in listed]).text()
     lines = [header]
-    for entry, row in zip(shown, rows, strict=True):
+    for entry, row in zip(listed, rows, strict=True):
         details = [*_details(entry), *dependents.get(entry.path, ())]
         lines += [row, *(f"    {line}" for line in details)]
-    specs = dict(_spec(entry) for entry in shown if entry.attributes)
+    specs = dict(_spec(entry) for entry in listed if entry.attributes)
     return [*lines, "", *(f"spec {digest}: {text}" for digest, text in specs.items())]
 
 
 def fate_of(entry: StoreEntry) -> tuple[Fate, str]:
-    """Whether an entry may be removed: if nobody needs it, only by name, or not; with the reason.
+    """Whether an entry may be removed (always, only by name, or never), and the reason.
 
-    Looks at the disk: what is beside it may have changed since it was listed.
+    Looks at the disk again, because its neighbours may have changed since it was listed.
     """
     path, kind = entry.path, entry.kind
     if kind in ("store", "archive"):
@@ -125,10 +126,10 @@ def fate_of(entry: StoreEntry) -> tuple[Fate, str]:
         if any(other.is_dir() for other in path.parent.glob(f"{escape(entry.base.name)}*")):
             return "kept", "content digests for a store that is there"
         return "unneeded", "content digests for a store that is not there"
-    inside = [at for at in (*path.glob("*"), *path.glob(".*/*")) if not at.is_symlink()]
+    contents = [at for at in (*path.glob("*"), *path.glob(".*/*")) if not at.is_symlink()]
     stores = [path] if kind == "previous" else []
     try:
-        stores += filter(is_store, inside)
+        stores += filter(is_store, contents)
         done = sum(_done(store) for store in {path, *stores} if is_store(store))
     except PipelineError as error:
         return "by name", f"unfinished build that cannot be read: {_first_clause(str(error))}"
@@ -144,9 +145,9 @@ def fate_of(entry: StoreEntry) -> tuple[Fate, str]:
 
 
 def find_named(entries: Sequence[StoreEntry], paths: Sequence[Path]) -> list[StoreEntry]:
-    """The entries at these paths, builds with their rows among them.
+    """The entries at these paths, which may be builds with feature rows.
 
-    Raises `ConfigError` for a path that may not be removed, with the reason.
+    Raises `ConfigError`, with the reason, for a path that may not be removed.
     """
     known = {entry.path.absolute(): entry for entry in entries}
     for path in paths:
@@ -161,7 +162,7 @@ def find_named(entries: Sequence[StoreEntry], paths: Sequence[Path]) -> list[Sto
 
 
 def describe_kept(entries: Sequence[StoreEntry]) -> list[str]:
-    """What looks like a leftover and stays, with the reason, a line each."""
+    """One line for each entry that looks like a leftover but stays, with the reason."""
     lines: list[str] = []
     for entry in entries:
         fate, why = fate_of(entry)
@@ -173,12 +174,12 @@ def describe_kept(entries: Sequence[StoreEntry]) -> list[str]:
 
 
 def remove_entry(entry: StoreEntry, fate: Fate) -> bool:
-    """Remove an entry if its fate is still this one; whether it was removed.
+    """Remove an entry if its fate is still this one; returns whether it was removed.
 
-    Takes the lock of its store meanwhile. Raises `StoreLocked` where a build has begun since.
+    Holds the lock of its store meanwhile. Raises `StoreLocked` where a build has begun since.
     """
     path, lock = entry.path, entry.base.with_name(entry.base.name + ".lock")
-    there = lock.exists()
+    had_lock = lock.exists()
     try:
         with build_lock(entry.base):
             if fate_of(entry)[0] != fate:
@@ -187,7 +188,7 @@ def remove_entry(entry: StoreEntry, fate: Fate) -> bool:
                 remove_folder(path, _owner(path) or STORE)
             else:
                 path.unlink(missing_ok=True)
-            if not there:
+            if not had_lock:
                 lock.unlink(missing_ok=True)
             return True
     except StoreLocked as error:
@@ -195,7 +196,7 @@ def remove_entry(entry: StoreEntry, fate: Fate) -> bool:
 
 
 def _walk(folder: Path, subfolders: bool) -> Iterator[tuple[Path, str, Path]]:
-    """What belongs to a store, at or below a folder; links to folders are not followed."""
+    """Everything that belongs to a store, in or below a folder; does not follow links."""
     for path in sorted(folder.iterdir()):
         name = _NAME.fullmatch(path.name)
         if name and name["suffix"] in _KINDS:
@@ -209,7 +210,7 @@ def _entry(path: Path, kind: str, base: Path) -> StoreEntry:
     holder = damage = None
     try:
         holder = lock_holder(lock) if lock.is_file() else None
-    except PipelineError as error:  # a file that is no lock tells nothing of the others
+    except PipelineError as error:  # a broken lock file says nothing about the other entries
         damage = str(error) if kind == "lock" else None
     entry = StoreEntry(path, kind, base, _bytes(path), damage=damage, holder=holder)
     try:
@@ -222,26 +223,26 @@ def _entry(path: Path, kind: str, base: Path) -> StoreEntry:
         if kind == "store" or is_store(path):
             root, specs = laid_out_attributes(path), read_specs(path)
             return replace(entry, attributes=root, specs=specs, done=_done(path))
-    except PipelineError as error:  # the others are listed
+    except PipelineError as error:  # list the others
         return replace(entry, damage=str(error))
-    except OSError as error:  # removed meanwhile, or not to be read
+    except OSError as error:  # removed meanwhile, or unreadable
         return replace(entry, damage=f"{path}: {error.strerror}")
     return entry
 
 
 def _bytes(path: Path) -> int:
-    """Bytes on the disk, each hard-linked file once."""
+    """Bytes on the disk; a hard-linked file counts once."""
     used: dict[tuple[int, int], int] = {}
     for file in path.rglob("*") if path.is_dir() else [path]:
         with suppress(OSError):  # removed meanwhile, or a link into an emptied cache
-            status = file.stat()  # of the file itself where a cache hands out symbolic links
+            status = file.stat()  # follows the symbolic links of a cache
             if not stat.S_ISDIR(status.st_mode):
                 used[status.st_dev, status.st_ino] = status.st_blocks * 512
     return sum(used.values())
 
 
 def _done(store: Path) -> int:
-    """Feature rows of a store or build that are there."""
+    """How many feature rows a store or build has."""
     return int(np.count_nonzero(read_rows(store, read_spec(store, CHECKSUMS))))
 
 
@@ -273,23 +274,26 @@ def _details(entry: StoreEntry) -> Iterator[str]:
 
 
 def _spec(entry: StoreEntry) -> tuple[str, str]:
-    """The beginning of a feature spec's digest; its main entries, which tell two specs apart."""
+    """The first digits of a feature spec's digest, and the entries that tell specs apart."""
     assert entry.attributes is not None
     features, document = entry.specs[FEATURES], entry.attributes.raw["feature_spec"]
     slots = [f"{slot.pooling} of layer {slot.layer}" for slot in entry.attributes.slots]
-    named = {"pooling": " + ".join(dict.fromkeys(slots))}
-    named |= {name: document[name] for name in _SPEC_ENTRIES if document.get(name)}
+    settings = {"pooling": " + ".join(dict.fromkeys(slots))}
+    settings |= {name: document[name] for name in _SPEC_ENTRIES if document.get(name)}
     return entry.attributes.feature_spec.digest[:8], ", ".join(
         [
             f"{features.shape[1]} slots x {features.shape[2]} in {features.stored_dtype}",
             f"sensor in {entry.specs['sensor/values'].dtype.name}",
-            *(f"{name} {shorten(str(it), 60, placeholder='…')}" for name, it in named.items()),
+            *(
+                f"{name} {shorten(str(value), 60, placeholder='…')}"
+                for name, value in settings.items()
+            ),
         ]
     )
 
 
 def _first_clause(damage: str) -> str:
-    """What is wrong, without what to run about it."""
+    """What is wrong, without the advice after it."""
     return damage.split(". ", 1)[0].splitlines()[0]
 
 
@@ -297,19 +301,19 @@ def _is_ours(entry: StoreEntry) -> bool:
     if entry.kind == "lock":
         return entry.path.is_file() and entry.damage is None
     if entry.kind == "ledger" and not entry.path.name.endswith(LEDGER_SUFFIX):
-        return entry.path.is_file()  # SQLite's own, beside it
+        return entry.path.is_file()  # SQLite's own files beside the ledger
     return is_ledger(entry.path) if entry.kind == "ledger" else _owner(entry.path) is not None
 
 
 def _owner(path: Path) -> OutputKind | None:
-    """The kind that a folder is of, None where it is not ours.
+    """The kind of a folder, None where it is not ours.
 
-    The marker decides: removed as another kind and killed meanwhile, it would be foreign to the
-    command that looks for its own kind there.
+    The marker decides. If the folder were removed as another kind and a kill stopped that, the
+    command that expects its own kind there would refuse the rest as foreign.
     """
     kinds = (STORE, ARCHIVE, KEPT, HELD)
     try:
         marked = next((kind for kind in kinds if kind.marks(path)), None)
         return marked or next((kind for kind in kinds if kind.owns(path)), None)
-    except StoreIncomplete:  # a group's metadata, but damaged
+    except StoreIncomplete:  # damaged metadata of a group
         return OutputKind(STORE.name, lambda _: True)

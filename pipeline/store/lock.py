@@ -1,4 +1,4 @@
-"""One builder a store: a lock that dies with its process."""
+"""A lock that allows one builder per store and ends with its process."""
 
 import errno
 import fcntl
@@ -18,10 +18,10 @@ from pipeline.base.errors import ConfigError, StoreLocked
 from pipeline.base.files import there
 
 _BEAT_S = 10.0
-"""How often the holder shows that it lives."""
+"""How often the holder renews the file's time as a sign of life."""
 
 _STALE_S = 60.0
-"""Without a sign of life for so long, a holder on another host is dead."""
+"""A holder on another host counts as dead after this long without a sign of life."""
 
 _HELD = re.compile(r"process \d{1,20} on \S{1,255}")
 
@@ -36,30 +36,30 @@ _NO_FLOCK = (errno.ENOSYS, errno.EOPNOTSUPP, errno.ENOLCK)
 def build_lock(target: Path) -> Generator[None]:
     """Hold `<name>.zarr.lock` beside the store.
 
-    The kernel releases it when the process ends, however it ends, so what a dead process of this
-    host left behind means nothing. A shared file system may keep flock to each host, or not have
-    it: there the holder's name and the time of the file, renewed every 10 s, are believed for a
-    minute. Raises `StoreLocked` naming the process that holds it, `ConfigError` where the file is
-    none of this project's.
+    The kernel releases it when the process ends in any way, so a file that a dead process of this
+    host left behind does not block. On a shared file system flock may work only within each host,
+    or not at all: then the holder's name and the file's time, renewed every 10 s, count for a
+    minute. Raises `StoreLocked`, which names the process that holds the lock, and `ConfigError`
+    where the file is not a lock of this project.
     """
     path = target.with_name(target.name + ".lock")
     path.parent.mkdir(parents=True, exist_ok=True)
-    if there(path):  # a link to nothing too, through which a file would be made elsewhere
+    if there(path):  # also a dangling link, which would create a file elsewhere
         _LOCK.check_file(path, 1000)
     with path.open("a+", encoding="utf-8", errors="replace") as file:
         locked, holder, elsewhere = _look(file, path, fcntl.LOCK_EX)
-        held = (
+        message = (
             f"{target}: being built by {holder or 'another process'} ({path}). Wait for it or stop "
             f"it, then run the same command again; or name another place than {target}."
         )
         if locked is False:
-            raise StoreLocked(held)
+            raise StoreLocked(message)
         if not path.exists() or path.stat().st_ino != os.fstat(file.fileno()).st_ino:
-            # Tidied away before it was locked: a lock on it excludes nobody.
+            # The file was removed before it was locked, so that this lock excludes nobody.
             raise StoreLocked(f"{path}: removed by another process just now; run the same again.")
         if elsewhere and (age_s := _age_s(file)) < _STALE_S:
             raise StoreLocked(
-                f"{held} It gave a sign of life {age_s:.0f} s ago; if it was killed, wait until "
+                f"{message} It gave a sign of life {age_s:.0f} s ago; if it was killed, wait until "
                 f"that is {_STALE_S:.0f} s."
             )
         if locked is None:
@@ -72,18 +72,18 @@ def build_lock(target: Path) -> Generator[None]:
             with _signs_of_life(file):
                 yield
         finally:
-            file.truncate(0)  # an empty one was left by its holder: nobody need wait for it
+            file.truncate(0)  # empty means released, so nobody waits
 
 
 def lock_holder(path: Path) -> str | None:
-    """Who holds a lock file, as it says; None where no living process does.
+    """The process named in a lock file; None where no living process holds it.
 
-    A holder on another host, whose lock the kernel may not show here, is believed for a minute
-    after its last sign of life, as `build_lock` believes it.
+    The kernel may not show a lock of another host. Such a holder counts as alive for a minute after
+    its last sign of life, as in `build_lock`.
     """
     _LOCK.check_file(path, 1000)
     with path.open("r", encoding="utf-8", errors="replace") as file:
-        # Shared, so that two that ask do not take each other for a builder.
+        # A shared lock, so that two readers do not take each other for a builder.
         locked, holder, elsewhere = _look(file, path, fcntl.LOCK_SH)
         age_s = abs(time.time() - path.stat().st_mtime)
         alive = locked is False or (elsewhere and age_s < _STALE_S)
@@ -91,10 +91,10 @@ def lock_holder(path: Path) -> str | None:
 
 
 def _look(file: TextIO, path: Path, how: int) -> tuple[bool | None, str, bool]:
-    """Whether the kernel's lock was to be had, who holds it as the file says, and whether that may
-    be a process of another host.
+    """Whether the lock was taken, the holder's name in the file, whether it may be on another host.
 
-    None where the file system has no locks. Raises `ConfigError` where the file is no lock.
+    The first is None where the file system has no locks. Raises `ConfigError` where the file is not
+    a lock of this project.
     """
     locked: bool | None = True
     try:
@@ -114,10 +114,10 @@ def _look(file: TextIO, path: Path, how: int) -> tuple[bool | None, str, bool]:
 
 
 def _age_s(file: TextIO) -> float:
-    """Seconds since the file's time by the clock of its own host; the time stays as it is.
+    """Seconds since the file's time, by the clock of the file's host; leaves the time unchanged.
 
-    One that lies ahead of that clock is no sign of life: it becomes the present, so that a holder
-    that shows none from now on is dead a minute later, not when the clock gets there.
+    A time in the future is set to the present: if its holder is dead, it is then noticed a minute
+    later, not only when the clock reaches that time.
     """
     seen = os.fstat(file.fileno()).st_mtime_ns
     os.utime(file.fileno())

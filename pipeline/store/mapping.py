@@ -1,13 +1,13 @@
-"""Chunk files side by side in memory: one flat range over all of them.
+"""Maps chunk files side by side into one flat range of memory.
 
 One range of addresses is reserved, each file is mapped into its place (`MAP_FIXED`), and one
-ndarray spans the whole, so that speed does not depend on how an array is cut into files. Maps are
-private and copy-on-write: a write by mistake changes neither the file nor kills the process.
+ndarray spans the range, so that speed does not depend on how an array is cut into files. Maps are
+private and copy-on-write: an accidental write neither changes the file nor kills the process.
 
-How a map is paged in depends on whether it fits in memory. What fits is populated once: every page
-is read in the files' order and entered in the page table, so that no gather stops at a page fault.
-For what does not fit, the kernel reads only pages that are asked for, and each batch asks for all
-its rows before it copies the first; otherwise read-ahead brings hundreds of times the useful bytes.
+How a map is paged in depends on whether it fits in memory. A map that fits is populated once: every
+page is read in the files' order and entered in the page table, so that no gather stops at a page
+fault. For a map that does not fit, the kernel reads only requested pages, and each batch requests
+all its rows before it copies the first; read-ahead would read hundreds of times the useful bytes.
 """
 
 import ctypes
@@ -41,10 +41,10 @@ _MAP_FIXED = 0x10
 _MAP_NORESERVE = 0x4000
 _PRIVATE = mmap.MAP_PRIVATE | _MAP_NORESERVE
 _MADV_POPULATE_READ = 22
-"""Of Linux 5.14; `mmap` does not name it."""
+"""New in Linux 5.14; Python's `mmap` has no name for it."""
 _POPULATE_STEP = 256 * 2**20
 _MEMORY_SHARE = 0.8
-"""Of the available memory, what maps may fill: the rest is for who reads them."""
+"""The share of available memory that maps may fill; the rest is for the process."""
 
 
 def map_flat(
@@ -93,7 +93,7 @@ def _mmap(address: int | None, length: int, protection: int, flags: int, descrip
 
 
 def fitting(sizes: Mapping[str, int], available: int, share: float = _MEMORY_SHARE) -> list[str]:
-    """Which of these bytes fit in a share of what is available: as many as can, smallest first."""
+    """The names whose bytes fit together in a share of the available ones, smallest first."""
     left = int(available * share)
     names: list[str] = []
     for name in sorted(sizes, key=lambda name: sizes[name]):
@@ -106,7 +106,7 @@ def fitting(sizes: Mapping[str, int], available: int, share: float = _MEMORY_SHA
 def populate(array: NDArray[Any]) -> None:
     """Read a map from `map_flat` into memory, in order; returns when all of it is there.
 
-    On a kernel that cannot (before Linux 5.14) reading is begun, and page faults remain.
+    A kernel before Linux 5.14 only begins to read, and page faults remain.
     """
     start, stop = _pages(array, 0, array.nbytes)
     for begin in range(start, stop, _POPULATE_STEP):
@@ -120,16 +120,16 @@ def populate(array: NDArray[Any]) -> None:
 
 
 def read_at_random(array: NDArray[Any]) -> None:
-    """Tell the kernel to read no page of a map ahead of the one that is asked for."""
+    """Tell the kernel to read only the requested pages of a map, without read-ahead."""
     if array.nbytes:
         start, stop = _pages(array, 0, array.nbytes)
         _madvise(start, stop - start, mmap.MADV_RANDOM)
 
 
 def will_need(array: NDArray[Any], first: NDArray[np.int64], rows: int) -> None:
-    """Begin to read rows `first[i]` to `first[i] + rows - 1` of a map, all at once.
+    """Begin to read rows `first[i]` to `first[i] + rows - 1` of a map, for all i at once.
 
-    A call into the kernel for each: what it saves is a wait for the disk each.
+    This costs one kernel call per i, and saves one wait for the disk per i.
     """
     if not array.nbytes:
         return
@@ -140,7 +140,7 @@ def will_need(array: NDArray[Any], first: NDArray[np.int64], rows: int) -> None:
 
 
 def _pages(array: NDArray[Any], begin: int, end: int) -> tuple[int, int]:
-    """The addresses of the whole pages that hold these bytes of an array."""
+    """The addresses from the page that holds byte `begin` of an array to its byte `end`."""
     address = array.ctypes.data
     start = (address + max(0, begin)) // mmap.PAGESIZE * mmap.PAGESIZE
     return start, address + min(end, array.nbytes)

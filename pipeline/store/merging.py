@@ -1,10 +1,10 @@
-"""Several finished stores of one feature spec and one embodiment become one, without the model.
+"""Merge finished stores of one feature spec and one embodiment into one, without the model.
 
-The merged store is a build like any other: laid out first, then filled with feature rows and their
-keys, resumed after a kill, sealed at last. Nothing is computed. Its plan is its own, for it cannot
-know the params that would describe all its recordings: `stages.extract` over the union of the
-sources lays it out anew, and takes every row from it by key without loading the model. The repair
-of a merged store is completed by merging the same stores again.
+The merged store is built like any other: laid out, filled with feature rows and their keys, resumed
+after a kill, and sealed. Nothing is computed. It has a plan of its own, because it cannot know the
+params that would describe all its recordings: `stages.extract` over all the sources lays the store
+out anew, and takes every row from it by key without loading the model. To complete the repair of a
+merged store, merge the same stores again.
 """
 
 import hashlib
@@ -62,15 +62,16 @@ _COPIED = [
 ]
 _BLOCK_BYTES = 32 * 2**20
 
-# Attributes of an input's root that would be false of the merged store.
+# Attributes of an input's root that would be wrong in the merged store.
 _NOT_TAKEN = (METADATA_DIGEST, SEAL, GOLDEN)
 
 
 @dataclass(frozen=True)
 class EpisodeRun:
-    """Episodes that stand one behind the other in an input and so in the merged store.
+    """Episodes that follow one another both in an input and in the merged store.
 
-    By stream: their `rows` in the input, and by how much the numbers of these rows grow.
+    For each stream, `rows` has their rows in the input, and `shift` what is added to row numbers in
+    the merged store.
     """
 
     store: FeatureStore
@@ -78,9 +79,9 @@ class EpisodeRun:
     shift: Mapping[str, int]
 
     def blocks(self, name: str, rows: range | None = None) -> Iterator[tuple[range, NDArray[Any]]]:
-        """Rows of an array of the input, or some of them, and what they hold, block by block.
+        """Rows of an array of the input (by default all of the run) and their values, by block.
 
-        Read with plain system calls: a file that was cut off is an error, not a SIGBUS.
+        Reads with plain system calls, so that a truncated file is an error and not a SIGBUS.
         """
         spec = read_spec(self.store.path, name)
         rows = self.rows[name.split("/")[0]] if rows is None else rows
@@ -90,11 +91,11 @@ class EpisodeRun:
 
 
 class MergedEpisodes:
-    """The episodes of several stores one behind the other, those of equal digest once.
+    """The episodes of several stores one after the other; those of equal digest only once.
 
-    Different episodes of one name, as of two places that both call a source `lab`, are named apart
-    by their store, and printed. `arrays` are those under `episode/`; `twice` counts the episodes
-    that an earlier input has, too.
+    Different episodes of the same name, such as from two places that both call a source `lab`, are
+    renamed after their store, and that is printed. `arrays` has the arrays under `episode/`;
+    `twice` counts the episodes that an earlier input also has.
     """
 
     def __init__(self, stores: Sequence[FeatureStore]) -> None:
@@ -104,7 +105,9 @@ class MergedEpisodes:
         taken: list[tuple[FeatureStore, Episode]] = []
         digests: set[str] = set()
         names: dict[tuple[str, str], Path] = {}
-        for store, episode in [(held, episode) for held in stores for episode in held.episodes]:
+        for store, episode in [
+            (opened, episode) for opened in stores for episode in opened.episodes
+        ]:
             if episode.digest in digests:
                 continue
             digests.add(episode.digest)
@@ -122,10 +125,10 @@ class MergedEpisodes:
         self.runs = [*self._runs(taken)]
 
     def _runs(self, taken: Sequence[tuple[FeatureStore, Episode]]) -> Iterator[EpisodeRun]:
-        """The episodes in runs that are as long as can be."""
+        """The episodes in runs, as long as possible."""
         numbered = ((store, episode, at) for at, (store, episode) in enumerate(taken))
-        for _, alike in groupby(numbered, lambda it: (it[0].path, it[1].index - it[2])):
-            run = list(alike)
+        for _, group in groupby(numbered, lambda it: (it[0].path, it[1].index - it[2])):
+            run = list(group)
             (store, first, begin), (_, last, _) = run[0], run[-1]
             rows = {
                 name: range(getattr(first, stream.rows).start, getattr(last, stream.rows).stop)
@@ -139,7 +142,7 @@ class MergedEpisodes:
 
     @property
     def plan(self) -> str:
-        """Names what the merged store will hold."""
+        """Identifies what the merged store will hold."""
         arrays = self.stores[0].array(FEATURES), self.having("sensor").array("sensor/values")
         document = {
             "spec": self.stores[0].spec["digest"],
@@ -151,7 +154,7 @@ class MergedEpisodes:
 
     @property
     def specs(self) -> dict[str, ArraySpec]:
-        """The arrays of the merged store: those of the inputs, as long as all episodes need."""
+        """The arrays of the merged store: as in the inputs, but long enough for all episodes."""
         specs: dict[str, ArraySpec] = {}
         for name in ARRAY_NAMES:
             stream = name.split("/")[0]
@@ -161,7 +164,7 @@ class MergedEpisodes:
         return specs
 
     def having(self, stream: str) -> FeatureStore:
-        """The first store that has this stream, or else the first store."""
+        """The first store that has this stream, or the first store if none has it."""
         return next((store for store in self.stores if _has(store, stream)), self.stores[0])
 
     def count(self, stream: str) -> int:
@@ -170,10 +173,10 @@ class MergedEpisodes:
 
 
 def merge(inputs: Sequence[Path], output: Path | None) -> MergedEpisodes | None:
-    """Make `output` of the episodes of all inputs, in their order; None where it is that already.
+    """Make `output` from the episodes of all inputs, in order; None if it already is that store.
 
-    An episode that several hold (equal digest) is taken once, from the first. Memory stays bounded;
-    every feature row has to match its checksum. The inputs are only read.
+    An episode in several inputs (equal digest) is taken once, from the first. Memory stays bounded;
+    every feature row must match its checksum. The inputs are only read.
 
     Raises `ConfigError` for paths that cannot be merged, `StoreMismatch` where specs or embodiments
     differ or `output` holds something else, `StoreIncomplete` where an input is damaged,
@@ -188,14 +191,14 @@ def merge(inputs: Sequence[Path], output: Path | None) -> MergedEpisodes | None:
         merged = MergedEpisodes(stores)
         plan = merged.plan
         part = read_plan(part_path(output))
-        if read_plan(output) == plan and part != plan:  # else a repair of it has begun
-            FeatureStore.open(output)  # refuses a store that is not as it was sealed
+        if read_plan(output) == plan and part != plan:  # else its repair has begun
+            FeatureStore.open(output)  # refuses a store that changed after sealing
             print(f"{output}: up to date, nothing to do")
             return None
         _check_free(output, plan)
         for store in stores:
             check_trailers(store.path)
-            store.array("tick/vl_row")  # which refuses positions of another episode
+            store.array("tick/vl_row")  # checks the positions that ticks hold
         with closing(StoreBuild(output, merged.specs, plan)) as build:
             if part == plan and build.layout_damage() is None:
                 print(f"continuing the interrupted build {build.part}")
@@ -225,7 +228,7 @@ def _checked_output(inputs: Sequence[Path], output: Path | None) -> Path:
 
 
 def _check_free(output: Path, plan: str) -> None:
-    """Refuse where something else stands, or is being built, in the place of the output."""
+    """Raise `StoreMismatch` where the output's place holds another store or build."""
     plans = {output: {read_plan(output)}, part_path(output): {*unfinished_plans(output)}}
     for place, found in plans.items():
         if found - {None, plan}:
@@ -237,13 +240,13 @@ def _check_free(output: Path, plan: str) -> None:
 
 def _check_alike(stores: Sequence[FeatureStore]) -> None:
     """Raise `StoreMismatch` that names what differs in spec, embodiment, rate or reuse."""
-    known: dict[str, Any] = {}
+    agreed: dict[str, Any] = {}
     for store in stores:
         form = _form(store)
-        hz, rate = known.get("action_hz"), form["action_hz"]
-        if hz and rate and abs(hz - rate) <= RATE_TOLERANCE * hz:  # recorded by clocks
+        hz, rate = agreed.get("action_hz"), form["action_hz"]
+        if hz and rate and abs(hz - rate) <= RATE_TOLERANCE * hz:  # measured rates differ a little
             form["action_hz"] = hz
-        differing = differences({name: known.get(name, form[name]) for name in form}, form)
+        differing = differences({name: agreed.get(name, form[name]) for name in form}, form)
         if differing:
             raise StoreMismatch(
                 f"{stores[0].path} and {store.path} cannot become one store, which has one feature "
@@ -251,11 +254,11 @@ def _check_alike(stores: Sequence[FeatureStore]) -> None:
                 + "\n  ".join(describe(differing))
                 + "\nExtract one of them again as the other was, or keep two stores."
             )
-        known = form | known
+        agreed = form | agreed
 
 
 def _form(store: FeatureStore) -> dict[str, Any]:
-    """What two stores have to agree on, where both have it."""
+    """What two stores must agree on, if both have it."""
     features = store.array(FEATURES)
     streams = {
         name: {"dtype": store.array(f"{name}/values").dtype.name, **store.streams[name]}
@@ -287,7 +290,7 @@ def _free_name(episode: Episode, store: Path, names: Mapping[tuple[str, str], Pa
 
 
 def _lay_out(build: StoreBuild, merged: MergedEpisodes, inodes: Sequence[Inode | None]) -> None:
-    """Everything but the feature rows; whole chunks at the first input's beginning are linked."""
+    """Write everything but the feature rows; link whole chunks at the start of the first input."""
     first = merged.stores[0]
     build.create()
     for name in _COPIED:
@@ -298,7 +301,7 @@ def _lay_out(build: StoreBuild, merged: MergedEpisodes, inodes: Sequence[Inode |
         build.write(name, 0, values)
     for name in tqdm(_COPIED, "streams", unit="array", disable=None, leave=False):
         for run in merged.runs:
-            for rows, values in run.blocks(name):  # those in linked chunks are there
+            for rows, values in run.blocks(name):  # `write` skips linked chunks
                 if name in POSITIONS:
                     values += run.shift[POSITIONS[name]]
                 build.write(name, rows.start + run.shift[name.split("/")[0]], values)
@@ -313,9 +316,9 @@ def _lay_out(build: StoreBuild, merged: MergedEpisodes, inodes: Sequence[Inode |
 
 
 def _fill(build: StoreBuild, merged: MergedEpisodes) -> None:
-    """Copy the feature rows that are missing, with their keys and environments.
+    """Copy the missing feature rows, with their keys and environments.
 
-    Raises `StoreIncomplete` naming a row that does not give its checksum.
+    Raises `StoreIncomplete`, which names a row that does not give its checksum.
     """
     missing, total = build.missing(), build.specs[FEATURES].shape[0]
     done = total - len(missing)
@@ -332,13 +335,13 @@ def _fill(build: StoreBuild, merged: MergedEpisodes) -> None:
                     checksums = store.array(CHECKSUMS)[inside]
                     check_row_checksums(store.path, source, block, values, checksums)
                     keys = [key.tobytes() for key in store.array(KEYS)[inside]]
-                    there = range(block.start + shift, block.stop + shift)
-                    build.commit(there, values, keys, number)
+                    target = range(block.start + shift, block.stop + shift)
+                    build.commit(target, values, keys, number)
                     progress.update(len(block))
 
 
 def _golden(merged: MergedEpisodes) -> list[GoldenFrames]:
-    """Golden rows of the merged store, chosen among those of the inputs and proven once more."""
+    """Golden rows of the merged store, chosen from those of the inputs, which are checked again."""
     inputs = {store.path: read_golden(store.path, store.array(KEYS)) for store in merged.stores}
     known = [
         replace(golden, row=golden.row + run.shift["vl"])

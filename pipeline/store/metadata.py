@@ -1,8 +1,8 @@
-"""A digest of all metadata of a store: an attribute has no checksum of its own.
+"""A digest of all metadata of a store, because an attribute has no checksum of its own.
 
-It covers the `zarr.json` of the root, of each group and of each array, as JSON of sorted keys; the
-root's without the digest itself. A finished store's root lists the checksum of every chunk file in
-its place (`SEAL`), so that this one digest binds all that the store holds.
+It covers the `zarr.json` of the root (without the digest itself), of each group and of each array,
+as JSON with sorted keys. A finished store's root lists the checksum of every chunk file by its
+place (`SEAL`), so that this one digest covers everything in the store.
 """
 
 import hashlib
@@ -20,12 +20,11 @@ from pipeline.store.schema import ARRAY_NAMES, GROUPS
 
 ATTRIBUTE = "metadata_digest"
 SEAL = "seal"
-"""The attribute of the root that holds, by array, the trailers of its chunk files in order, in hex.
-"""
+"""The root's attribute with the trailers of each array's chunk files, in order, in hex."""
 
 
 def note_metadata(root: Path, attributes: Mapping[str, Any] | None = None) -> None:
-    """Write attributes into the root, or those that it has, and the digest with them."""
+    """Write the digest into the root, with these attributes or else those that it has."""
     digest, _ = _digests(root, attributes)
     kept = group_attributes(root) if attributes is None else attributes
     zarr.open_group(root, mode="r+").attrs.put({**kept, ATTRIBUTE: digest})
@@ -43,14 +42,14 @@ def metadata_damage(root: Path) -> str | None:
 
 
 def check_metadata(root: Path) -> None:
-    """Raise `StoreIncomplete` where the metadata of a finished store are not as written."""
+    """Raise `StoreIncomplete` where the metadata of a finished store were changed."""
     if what := metadata_damage(root):
         raise store_border(root).refusal(root / "zarr.json", what)
 
 
 def _digests(root: Path, attributes: Mapping[str, Any] | None = None) -> tuple[str, Any]:
-    """That of the metadata as they are, or would be with other attributes of the root, and the one
-    that stands in the attributes."""
+    """The digest of the metadata, computed with these root attributes or else those on disk, and
+    the digest stored in the attributes."""
     kept = dict(group_attributes(root) if attributes is None else attributes)
     stored = kept.pop(ATTRIBUTE, None)
     places, border = ("", *GROUPS, *ARRAY_NAMES), store_border(root)

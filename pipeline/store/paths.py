@@ -4,8 +4,9 @@
     <name>.zarr.part       the build; `.known/<n>` in it are interrupted builds of other plans
     <name>.zarr.previous   the replaced store, kept and marked, where it has more episodes
 
-Whoever changes one of them holds `<name>.zarr.lock` and calls `recover` first. A part goes through
-these states; rows are known from the store, the previous one, a part with a plan and its `.known`:
+A process that changes one of them must hold `<name>.zarr.lock` and call `recover` first. A part
+goes through these states. Known rows come from the store, the previous one, a part with a plan and
+its `.known`:
 
     begin_build      finish_layout        finish          put_in_place
     ──────────► bare ────────────► laid out ─────► sealed ────────────► <name>.zarr
@@ -15,11 +16,11 @@ these states; rows are known from the store, the previous one, a part with a pla
                  └─────────────────┘ set_build_aside: another plan begins
 
 A kill leaves:
-- a bare part: the next build empties it, `.known` stays.
-- a part laid out: the same plan goes on, another one sets it aside.
+- a bare part: the next build empties it; `.known` stays.
+- a laid-out part: the same plan continues it, another plan sets it aside.
 - half of `set_build_aside`: `recover` completes it.
-- a sealed part without a store, which lies in `.replaced` of that part (from where `recover` brings
-  it back) or, where it is to be kept, as the previous one: the same plan only renames the part.
+- a sealed part without a store: the old store is in `.replaced` of that part (`recover` brings it
+  back) or, if it is kept, is the previous one; a run of the same plan only renames the part.
 - a new store with `.known` or `.replaced` still in it: `recover` removes these.
 """
 
@@ -55,10 +56,10 @@ from pipeline.store.repair_hints import (
 from pipeline.store.schema import SCHEMA
 
 MERGED = "merge-"
-"""How the plan of a store begins that was not extracted but merged."""
+"""Prefix of the plan of a store that was merged, not extracted."""
 
 ASIDE_METADATA = ".zarr.json"
-"""What `set_build_aside` calls the metadata of a build until the rest of it has moved."""
+"""The name that `set_build_aside` gives a build's metadata until the rest has moved."""
 Inode = tuple[int, int]
 
 
@@ -68,34 +69,38 @@ def part_path(target: Path) -> Path:
 
 
 def previous_path(target: Path) -> Path:
-    """Where the store that was replaced is kept."""
+    """Where the replaced store is kept."""
     return target.with_name(target.name + ".previous")
 
 
 def is_store(path: Path) -> bool:
-    """Whether a store of this project, or a laid-out build of one, lies there."""
+    """Whether a store of this project, or a laid-out build of one, lies at `path`."""
     attributes = group_attributes(path)
     return "schema" in attributes and bool({"plan", "feature_spec"} & attributes.keys())
 
 
 STORE = OutputKind("a feature store", is_store)
 _LINK_ENDS = "/."
-"""How a link ends that was kept: nothing is written into the folder behind it."""
+"""The end of a kept link; it marks the link, because nothing is written into its target."""
 
 
 def _is_kept_link(path: Path) -> bool:
-    # A Path would leave the end out.
+    # A Path would drop this end.
     return path.is_symlink() and os.readlink(path).endswith(_LINK_ENDS)  # noqa: PTH115
 
 
 KEPT = OutputKind("a store of before, kept for its rows,", _is_kept_link)
-"""The previous store, by its marker, whose line earlier versions wrote: a user's copy is none."""
+"""The previous store, known by its marker; a user's copy has no marker.
+
+The name must not change: markers of earlier versions contain it.
+"""
 
 
 def refuse_foreign_store(target: Path) -> None:
-    """Raise `ConfigError` where what lies at a store's place or its build's is neither.
+    """Raise `ConfigError` where something foreign lies in a store's place or its build's.
 
-    Nor may a build lie behind a link: what replaces a store is renamed, on one file system.
+    A build may not lie behind a link either, because a build is renamed to the store, which works
+    only on one file system.
     """
     for place in (target, part_path(target)):
         refuse_foreign(place, STORE)
@@ -108,7 +113,7 @@ def refuse_foreign_store(target: Path) -> None:
 
 
 def recover(target: Path) -> None:
-    """Complete or undo what a kill stopped, before anything is written there.
+    """Complete or undo the step that a kill stopped, before anything is written.
 
     Raises `ConfigError` where something lies there that this project did not write, or that an
     earlier version left.
@@ -126,16 +131,16 @@ def recover(target: Path) -> None:
     files.recover(part, target, STORE)
     remove_folder(target / KNOWN, STORE)
     if KEPT.marks(previous := previous_path(target)) and not (previous / "zarr.json").exists():
-        remove_folder(previous, KEPT)  # half removed
+        remove_folder(previous, KEPT)  # its removal was stopped
     for left in sorted(target.parent.glob(f"{glob.escape(target.name)}.known-*")):
-        if left.name.rpartition("-")[2].isdigit() and is_store(left):  # of earlier versions
+        if left.name.rpartition("-")[2].isdigit() and is_store(left):  # earlier versions left it
             left.rename(_place_aside(part))
     for moving in part.glob(f"{KNOWN}/*/{ASIDE_METADATA}"):
         _move_build(part, moving.parent)
 
 
 def begin_build(target: Path) -> None:
-    """Make an empty part, in place of what was begun there; builds that were set aside stay."""
+    """Make an empty part and remove an older one; builds that were set aside stay."""
     begin_folder(part_path(target), STORE, but=KNOWN)
 
 
@@ -160,10 +165,10 @@ def unfinished_plans(target: Path) -> list[str]:
 
 
 def put_in_place(target: Path, keep: bool = False) -> None:
-    """Rename a sealed part to the store; remove what was there, or `keep` it as the previous one.
+    """Rename a sealed part to the store; remove the old store, or `keep` it as the previous one.
 
-    Of a store behind a symbolic link the link alone goes; one that is kept is a link to the same
-    folder. Raises `ConfigError` where something that is not this project's lies in a place.
+    If the old store is a symbolic link, only the link is removed; to keep it, a link to the same
+    folder is made. Raises `ConfigError` where something foreign lies in one of the places.
     """
     previous = previous_path(target)
     if keep and there(target):
@@ -173,7 +178,7 @@ def put_in_place(target: Path, keep: bool = False) -> None:
             previous.symlink_to(os.path.realpath(target) + _LINK_ENDS)
             target.unlink()
         else:
-            mark(target, KEPT)  # before the older one goes: a full disk may refuse it
+            mark(target, KEPT)  # before the older one is removed: a full disk may refuse this
             remove_folder(previous, KEPT)
             target.rename(previous)
     files.put_in_place(part_path(target), target, STORE)
@@ -197,7 +202,7 @@ def _move_build(part: Path, folder: Path) -> None:
 def read_plan(store: Path) -> str | None:
     """The plan of a store or a laid-out build; None where there is neither.
 
-    Raises `StoreIncomplete` where there is one that has lost it.
+    Raises `StoreIncomplete` where a store or build has lost its plan.
     """
     plan = group_attributes(store).get("plan")
     if not isinstance(plan, str) and is_store(store):
@@ -217,17 +222,17 @@ def read_attributes(root: Path) -> StoreAttributes:
 
 
 def laid_out_attributes(root: Path) -> StoreAttributes:
-    """The root attributes of a store or a laid-out build, wherever it lies."""
+    """The root attributes of a store or a laid-out build at any path."""
     return StoreAttributes.of(root, group_attributes(root))
 
 
 def find_attributes(root: Path) -> dict[str, Any]:
-    """The root attributes of a finished store, as they stand there: they may be wrong.
+    """The root attributes of a finished store, unchecked.
 
-    Raises `StoreIncomplete` where there is none, only a build of it, one that lost them or
-    something else, and `StoreMismatch` where it follows another schema or is an archive.
+    Raises `StoreIncomplete` where there is no store, only a build of it, a store without
+    attributes, or something else, and `StoreMismatch` where it has another schema or is an archive.
     """
-    build = root.name.endswith(".part")  # which looks like a store until its files are read
+    build = root.name.endswith(".part")  # its metadata look like a store's
     attributes = {} if build else group_attributes(root)
     if "archive" in attributes:
         raise StoreMismatch(
@@ -253,7 +258,7 @@ def find_attributes(root: Path) -> dict[str, Any]:
 
 
 def inode_of(store: Path) -> Inode | None:
-    """Tells a store from another that took its place; None where there is none."""
+    """Identifies the store at a path, to notice a replacement; None where there is none."""
     try:
         status = store.stat()
     except FileNotFoundError:
@@ -262,7 +267,7 @@ def inode_of(store: Path) -> Inode | None:
 
 
 def refuse_replaced(store: Path, before: Inode | None) -> None:
-    """Raise `StoreMismatch` where a store is no longer the one that it was `before`.
+    """Raise `StoreMismatch` where the store is not the one whose inode was `before`.
 
     A finished store is never modified, but an extraction may put another in its place.
     """
@@ -274,7 +279,7 @@ def refuse_replaced(store: Path, before: Inode | None) -> None:
 
 
 def group_attributes(path: Path) -> dict[str, Any]:
-    """Those of the zarr group at `path`; none where there is no group.
+    """The attributes of the zarr group at `path`; empty where there is no group.
 
     Raises `StoreIncomplete` where its metadata cannot be read.
     """

@@ -1,6 +1,6 @@
 """Open a finished store and gather batches from it at memory speed.
 
-torch is imported with the first batch, not before: whoever only looks at a store needs none.
+torch is imported with the first batch, not before, because to inspect a store needs no torch.
 """
 
 import os
@@ -43,7 +43,7 @@ def _one_thread() -> None:
         sys.modules["torch"].set_num_threads(1)
 
 
-# OpenMP's threads do not survive a fork, and a forked process that waits for them waits for ever.
+# OpenMP's threads do not survive a fork, and a forked process would wait for them for ever.
 os.register_at_fork(after_in_child=_one_thread)
 
 
@@ -63,8 +63,8 @@ class FeatureStore:
     def open(cls, path: str | Path) -> "FeatureStore":
         """Map a store.
 
-        Raises `StoreIncomplete` when it is not there, unfinished or damaged, `StoreMismatch` when
-        it follows another schema.
+        Raises `StoreIncomplete` when it is missing, unfinished or damaged, `StoreMismatch` when it
+        has another schema.
         """
         root = Path(path)
         attributes, specs = read_attributes(root), read_specs(root)
@@ -78,21 +78,22 @@ class FeatureStore:
         return FeatureStore.open, (self.path,)
 
     def array(self, name: str) -> NDArray[Any]:
-        """Any array of the store by name, mapped; what is written into it is never kept.
+        """An array of the store by name, mapped; writes into it never reach the file.
 
-        Raises `StoreIncomplete` where positions of ticks are asked for and lie outside.
+        Raises `StoreIncomplete` for an array of positions in which a tick points outside its
+        episode.
         """
         return (self._sound_arrays if name in POSITIONS else self._arrays)[name]
 
     @cached_property
     def _sound_arrays(self) -> Mapping[str, NDArray[Any]]:
-        """The arrays, once the positions that ticks hold were checked: that takes a read of all."""
+        """The arrays, after a check of the ticks' positions, which reads all of them."""
         check_positions(self.path, self._arrays)
         return self._arrays
 
     @property
     def spec(self) -> dict[str, Any]:
-        """The feature spec: the whole document and its digest."""
+        """The feature spec: the complete document with its digest."""
         return dict(self.attrs["feature_spec"])
 
     @property
@@ -107,7 +108,7 @@ class FeatureStore:
 
     @property
     def action_hz(self) -> float | None:
-        """Ticks a second; None in older stores of recorded rows, which do not say it."""
+        """Ticks per second; None in older stores of recorded rows, which do not record it."""
         return self.attrs["action_hz"]
 
     @property
@@ -148,9 +149,9 @@ class FeatureStore:
 
     @cached_property
     def golden(self) -> tuple[GoldenRow, ...]:
-        """The golden rows with their features; none where an earlier version wrote the store.
+        """The golden rows with their features; empty where an earlier version wrote the store.
 
-        Raises `StoreIncomplete` where the frames of one do not give its key.
+        Raises `StoreIncomplete` where the frames of a golden row do not give its key.
         """
         proven = read_golden(self.path, self._arrays[KEYS])
         return tuple(self._golden_row(frames) for frames in proven)
@@ -177,13 +178,13 @@ class FeatureStore:
         return episode_of(self._arrays, ticks)
 
     def tick_step(self) -> float:
-        """The median time from a tick to the next of its episode, in s; NaN where there is none."""
+        """The median time in s from a tick to the next in its episode; NaN without such ticks."""
         steps = np.diff(self._arrays["tick/time"])
         steps = steps[np.diff(self.episode_of(np.arange(self.ticks))) == 0]
         return float(np.median(steps)) if len(steps) else float("nan")
 
     def feature_age(self, ticks: NDArray[np.int64]) -> NDArray[np.float64]:
-        """(tick,) s since the newest frame that the features of these ticks have seen."""
+        """(tick,) s from the newest frame behind each tick's features to the tick."""
         return self.gatherer.feature_age(ticks, self.array("tick/vl_row")[ticks])
 
     def gather(
@@ -200,18 +201,19 @@ class FeatureStore:
         sensor_window_s: float | None = None,
         state_window_s: float | None = None,
     ) -> "Batch":
-        """The batch of these ticks (store-global), into the buffers of `out` where given.
+        """The batch of these ticks (store-global), in the buffers of `out` if given.
 
-        Windows end at the last reading at or before the tick less the lag. They hold at most
-        `sensor_window` and `state_window` readings, and none that is more than `sensor_window_s`
-        or `state_window_s` older than the tick. `feature_lag` goes back whole VL rows, not beyond
-        the episode's first. A lag is that of all ticks, or (batch,). Ages are those at the tick.
-        The action chunk begins at its own tick and repeats the episode's last action, marked
-        invalid, beyond its end. `variants` (batch,) says which variant of its VL row each tick
-        sees; without it all see 0, the plain frames.
+        A window ends at the last reading at or before the tick minus the lag. It holds at most
+        `sensor_window` or `state_window` readings, and none that is more than `sensor_window_s` or
+        `state_window_s` older than the tick. `feature_lag` goes back whole VL rows, but not before
+        the episode's first. A lag is one number for all ticks, or (batch,). Ages are measured at
+        the tick. The action chunk begins at its own tick; after the episode's end it repeats the
+        last action, marked invalid. `variants` (batch,) is the variant of the VL row for each tick;
+        by default 0, the plain frames.
 
-        Raises `IndexError` for a tick the store does not have and `ValueError` for a variant it
-        does not have, an `out` of other sizes, or a negative lag, which would show the future.
+        Raises `IndexError` for a tick that the store does not have, and `ValueError` for a variant
+        that it does not have, an `out` of other sizes, or a negative lag, which would show the
+        future.
         """
         windows = (horizon, sensor_window, state_window, sensor_window_s, state_window_s)
         lags = (feature_lag, sensor_lag_s, state_lag_s)
@@ -227,7 +229,7 @@ class FeatureStore:
         out: "Batch | None",
         variants: NDArray[np.int64] | None,
     ) -> "tuple[Batch, Selection]":
-        """The first half of `gather`: all but the wide fields of a batch, and where those lie."""
+        """The first half of `gather`: fill the fields that are not wide; find the wide ones."""
         if any(np.min(lag, initial=0) < 0 for lag in lags):
             raise ValueError(f"a lag goes back in time and cannot be negative, found {lags}")
         tick = np.asarray(ticks, np.int64)
@@ -252,10 +254,10 @@ class FeatureStore:
         return batch, self.gatherer.select(batch, tick, *lags, variants, oldest_s)
 
     def warm(self, but: Collection[str] = ()) -> None:
-        """Begin to read what memory has room for, once, in the background; no field of `but`.
+        """Begin to read the fields that fit in memory, once, in the background; not those in `but`.
 
-        The thread that reads ends with the process, and a forked one does without it: page faults
-        bring what it has not read.
+        The reading thread ends with the process, and a forked process has none: page faults read
+        the rest.
         """
         if not self._warmed:
             self._warmed = True
@@ -264,19 +266,19 @@ class FeatureStore:
 
     @cached_property
     def gatherer(self) -> "Gatherer":
-        """What fills batches: their buffers, the maps behind them, the second half of `gather`."""
+        """Fills batches: it has their buffers, the maps and the second half of `gather`."""
         from pipeline.store.gather import Gatherer
 
         return Gatherer(self._sound_arrays, self.variants)
 
 
 def episode_name(episode: Episode) -> str:
-    """`source/id`, by which a checkpoint, a report and an error call an episode."""
+    """`source/id`, the name of an episode in checkpoints, reports and errors."""
     return f"{episode.source}/{episode.id}"
 
 
 def place(store: FeatureStore, stream: str, row: int) -> str:
-    """Where a store-global row of a stream lies: episode, row in it and time on its clock."""
+    """Where a store-global row of a stream lies: episode, row in the episode and its time."""
     starts = store.array(f"episode/{stream}_start")
     index = int(starts.searchsorted(row, side="right")) - 1
     time_s = float(store.array(f"{stream}/time")[row])
@@ -287,5 +289,5 @@ def place(store: FeatureStore, stream: str, row: int) -> str:
 
 
 def map_array(root: Path, spec: ArraySpec) -> NDArray[Any]:
-    """The map of an array whose chunk files were checked."""
+    """Map an array whose chunk files were checked."""
     return map_flat(chunk_paths(root, spec), spec.chunk_bytes, spec.shape, spec.dtype)

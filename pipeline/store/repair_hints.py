@@ -1,6 +1,6 @@
-"""What to run about a store that is not as it was written, as full commands.
+"""Full commands to run when a store is damaged.
 
-Each names the store that was found damaged, which need not be that of params.yaml.
+Each names the damaged store, which may be another than that of params.yaml.
 """
 
 import re
@@ -11,22 +11,22 @@ from pipeline.base.commands import command
 from pipeline.base.config import setting
 
 KNOWN = ".known"
-"""The folder in a part that holds interrupted builds of other plans."""
+"""The folder within a part for interrupted builds of other plans."""
 _STORE = re.compile(r"(?P<base>.+?\.zarr)(?:\.part|\.previous)?")
 
 
 def extract_command(store: Path) -> str:
-    """Makes a store, or completes the build of it."""
+    """The command that makes a store or completes its build."""
     return command("extract", setting("extract.store", store))
 
 
 def gc_command(path: Path) -> str:
-    """Removes an unfinished build."""
+    """The command that removes an unfinished build."""
     return command("store", "gc", shlex.quote(str(path)), "--remove")
 
 
 def restore_command(archive: Path) -> str:
-    """Makes a store from its archive, beside it."""
+    """The command that restores a store beside its archive."""
     name = archive.stem.removesuffix(".archive")
     store = archive.with_name(f"{name if name != archive.stem else name + '.restored'}.zarr")
     places = setting("archive.output", archive), setting("archive.store", store)
@@ -34,7 +34,7 @@ def restore_command(archive: Path) -> str:
 
 
 def mend(path: Path) -> str:
-    """What to do about a damaged store or build, of which `path` is the folder or a file in it."""
+    """What to do about a damaged store or build; `path` is its folder or a file in it."""
     folder, store = _owner(path)
     for place in (path, *path.parents):
         if place.parent.name == KNOWN:
@@ -46,7 +46,7 @@ def mend(path: Path) -> str:
 
 
 def start_over(path: Path) -> str:
-    """What to do where the root's metadata no longer say what a store or build was made of."""
+    """What to do where a store's or build's root metadata no longer say what it was made of."""
     folder, store = _owner(path)
     if folder != store:
         return mend(path)
@@ -58,8 +58,8 @@ def start_over(path: Path) -> str:
 
 
 def _owner(path: Path) -> tuple[Path, Path]:
-    """The store or build that a path is or lies in, and the store that this is or will be."""
+    """The store or build at or around a path, and the store's final path."""
     for folder in (path, *path.parents):
-        if found := _STORE.fullmatch(folder.name):
-            return folder, folder.with_name(found["base"])
+        if match := _STORE.fullmatch(folder.name):
+            return folder, folder.with_name(match["base"])
     return path, path

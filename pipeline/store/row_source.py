@@ -1,4 +1,4 @@
-"""Take over what another store or an abandoned build already knows."""
+"""Take known rows from another store or an abandoned build."""
 
 from collections import defaultdict
 from functools import cached_property
@@ -28,8 +28,8 @@ from pipeline.store.writer import EnvironmentLog, environment_at
 class RowSource:
     """Known feature rows by key, and streams by episode.
 
-    Works on a finished store and on a laid-out build alike: it reads chunk files, not chunks.
-    Raises `StoreIncomplete` where a finished store's keys or episodes are not as they were written.
+    It reads a finished store or a laid-out build, because it reads chunk files without zarr. Raises
+    `StoreIncomplete` where a finished store's keys or episodes were changed.
     """
 
     def __init__(self, path: Path) -> None:
@@ -42,15 +42,15 @@ class RowSource:
 
     @cached_property
     def rows(self) -> dict[bytes, int]:
-        """Where the features of each key are."""
+        """The row of each key."""
         keys = self._read(KEYS)
         return {keys[row].tobytes(): int(row) for row in np.flatnonzero(self._read(CHECKSUMS))}
 
     def keys_of(self, content: str, instruction: str) -> dict[bytes, bytes]:
-        """Keys of the rows of episodes of this content and instruction, by their frame times.
+        """Keys of the rows of episodes with this content and instruction, by frame times.
 
-        Under one feature spec, the same files and the same capture time of every view (the bytes
-        of a row of `vl/frame_time`) are the same frames: no pixel needs to be decoded to tell.
+        With the same files, equal capture times of every view (the bytes of a row of
+        `vl/frame_time`) mean equal frames, so that no pixel needs to be decoded.
         """
         episodes = self._episodes_by_text.get((content, instruction), [])
         if not episodes:
@@ -65,14 +65,14 @@ class RowSource:
         }
 
     def take(self, key: bytes) -> tuple[NDArray[Any], dict[str, Any]] | None:
-        """The feature row (slot, dim) of a key, and with which software and hardware it was
-        computed, empty where that is not noted; None where it is unknown or damaged."""
+        """The feature row (slot, dim) of a key, and the software and hardware that computed it
+        (empty if not recorded); None where the row is unknown or damaged."""
         row = self.rows.get(key)
         if row is None:
             return None
         try:
             values = read_rows(self.path, self.specs[FEATURES], row, row + 1)
-        except StoreIncomplete:  # its file is cut short or gone: the row is computed again
+        except StoreIncomplete:  # its file is truncated or gone: compute the row again
             return None
         if row_checksums(values)[0] != self._read(CHECKSUMS)[row]:
             return None
@@ -92,18 +92,18 @@ class RowSource:
 
     @cached_property
     def texts(self) -> list[EpisodeText]:
-        """Of each episode, in order. Equal `digest`, equal rows; equal `content`, equal streams."""
+        """The texts of all episodes. Equal `digest`: equal rows. Equal `content`: equal streams."""
         index = [name for name in self.specs if name.startswith("episode/")]
         read = [self.specs[name] for name in ("vl/frame_time", *index)]
         if not self._finished and find_damage(self.path, read):
-            return []  # rows are known by their keys alone, frame by frame
+            return []  # rows can then be found only by key, frame by frame
         arrays = {name: self._read(name) for name in index}
         check_index(self.path, arrays, rows_of(self.specs))
         return read_texts(self.path, arrays)
 
     @property
     def _finished(self) -> bool:
-        """Whether every chunk has a trailer; those of feature rows in a build have none yet."""
+        """Whether every chunk has a trailer; in a build, feature rows have none yet."""
         return self.path.suffix in (".zarr", ".previous")
 
     def _read(self, name: str) -> NDArray[Any]:

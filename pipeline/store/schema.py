@@ -1,9 +1,9 @@
 """What a store holds: its arrays, their dtypes and shapes, and how they lie in files.
 
 Every array is a plain zarr v3 array without compression, chunked along its first axis only, by a
-multiple of 4,096 rows. So the data of a chunk file begin at byte 0 and fill whole pages whatever
-the width of a row, a 4-byte crc32c trails behind, and the file is at once a zarr chunk and a flat
-block that can be mapped.
+multiple of 4,096 rows. So the data of a chunk file begin at byte 0 and fill whole pages for any row
+width, and a 4-byte crc32c follows them. The file is both a zarr chunk and a flat block that can be
+mapped.
 """
 
 import math
@@ -36,17 +36,17 @@ INCREMENTAL = (FEATURES, KEYS, CHECKSUMS)
 
 @dataclass(frozen=True)
 class StoredStream:
-    """Rows of which each episode has a range: those of the arrays `<stream>/…`.
+    """A stream: the rows of the arrays `<stream>/…`, of which each episode has a range.
 
-    `episode/<stream>_start` says where the range of each episode begins.
+    `episode/<stream>_start` holds the start of each episode's range.
     """
 
     rows: str
-    """What `Episode` calls the range of an episode."""
+    """The field of `Episode` with its range."""
     row: str
-    """How messages call one of them."""
+    """The word for one row in messages."""
     counted_by: str = ""
-    """The array of ticks that holds positions among these rows."""
+    """The array with each tick's position among these rows."""
 
 
 STREAMS = {
@@ -58,7 +58,7 @@ STREAMS = {
 
 
 POSITIONS = {stored.counted_by: stream for stream, stored in STREAMS.items() if stored.counted_by}
-"""Array of positions that ticks hold -> the stream among whose rows they are."""
+"""Array of positions that ticks hold -> the stream whose rows they count."""
 
 
 @dataclass(frozen=True)
@@ -69,7 +69,7 @@ class ArraySpec:
     shape: tuple[int, ...]
     dtype: np.dtype[Any]
     stored_chunk_rows: int | None = None
-    """As an array on disk is cut; None for one that follows the rule."""
+    """Rows per chunk of an array on disk; None for an array that follows the rule."""
 
     @property
     def dimensions(self) -> tuple[str, ...]:
@@ -78,12 +78,12 @@ class ArraySpec:
 
     @property
     def stored_dtype(self) -> str:
-        """The name of what its numbers are: only bfloat16 has another dtype in numpy."""
+        """The name of its number type; only bfloat16 has another dtype in numpy."""
         return "bfloat16" if self.attributes else self.dtype.name
 
     @property
     def attributes(self) -> dict[str, Any]:
-        """Those of the zarr array."""
+        """The attributes of the zarr array."""
         return {"dtype": "bfloat16"} if self.dtype == np.uint16 else {}
 
     @property
@@ -93,12 +93,12 @@ class ArraySpec:
 
     @property
     def data_bytes(self) -> int:
-        """Bytes of all rows, padding and trailers left out."""
+        """Bytes of all rows, without padding and trailers."""
         return self.shape[0] * self.row_bytes
 
     @property
     def chunk_rows(self) -> int:
-        """Rows a chunk: about 64 MB for wide rows, all of a small array in one."""
+        """Rows per chunk: about 64 MB for wide rows; a small array is one chunk."""
         if self.stored_chunk_rows is not None:
             return self.stored_chunk_rows
         wide = max(1, CHUNK_BYTES // (max(1, self.row_bytes) * ROW_MULTIPLE)) * ROW_MULTIPLE
@@ -139,7 +139,7 @@ class ArraySpec:
         }
 
     def create(self, root: Path | dict[str, Any], **otherwise: Any) -> "zarr.Array[Any]":
-        """Write the array's zarr metadata below `root`; an archive cuts and packs it otherwise."""
+        """Write the array's zarr metadata below `root`; an archive passes its chunks and codecs."""
         as_in_a_store: dict[str, Any] = {
             "chunks": (self.chunk_rows, *(max(1, size) for size in self.shape[1:])),
             "compressors": [Crc32cCodec()],
@@ -170,7 +170,7 @@ def chunk_path(root: Path, spec: ArraySpec, chunk: int) -> Path:
 
 @dataclass(frozen=True)
 class Sizes:
-    """How long each axis of a store's arrays is; a width of 0 is an absent stream."""
+    """The length of each axis of a store's arrays; a stream of width 0 is absent."""
 
     episode: int
     tick: int
@@ -178,14 +178,14 @@ class Sizes:
     sensor_reading: int
     state_reading: int
     byte: int
-    """Of the texts of all episodes."""
+    """Bytes of the texts of all episodes."""
     slot: int
-    """Of a VL row: those of all its variants, one variant after the other."""
+    """Slots of a VL row, of all its variants, one variant after the other."""
     dim: int
     view: int
     action_dim: int
     channel: int
-    """Of the sensor."""
+    """Channels of the sensor."""
     state_dim: int
 
 
@@ -209,8 +209,7 @@ _ARRAYS = {
     "episode/source": ("i4", "episode"),
     "episode/text": ("u1", "byte"),
 }
-"""Every array in the order of the contract: its type, where none of the params says so, and axes.
-"""
+"""Every array in the order of the contract: its type ("" where a param sets it), then its axes."""
 ARRAY_NAMES = tuple(_ARRAYS)
 GROUPS = tuple(sorted({name.partition("/")[0] for name in ARRAY_NAMES}))
 
@@ -232,30 +231,30 @@ def read_specs(root: Path) -> dict[str, ArraySpec]:
 
 
 def read_spec(root: Path, name: str) -> ArraySpec:
-    """An array of a store or a build as its metadata on disk say.
+    """An array of a store or a build, from its metadata on disk.
 
-    Raises `StoreIncomplete` where they cannot be read or are not as the contract says.
+    Raises `StoreIncomplete` where they cannot be read or do not follow the contract.
     """
     path, border = root / name / "zarr.json", store_border(root)
     spec = array_of(border.read_json(path, dict[str, Any]), name, path, border)
-    if spec.chunk_count > _FEW:  # a shape can claim more chunks than could ever be counted
+    if spec.chunk_count > _FEW:  # a false shape can claim a huge number
         folder = root / name / "c"
-        there = len(os.listdir(folder)) if folder.is_dir() else 0
-        if spec.chunk_count > _FEW + 2 * there:
-            what = f"expected {spec.chunk_count:,} chunk files by the shape, found {there:,}"
+        present = len(os.listdir(folder)) if folder.is_dir() else 0
+        if spec.chunk_count > _FEW + 2 * present:
+            what = f"expected {spec.chunk_count:,} chunk files by the shape, found {present:,}"
             raise border.refusal(path, what)
     return spec
 
 
 _FEW = 64
-"""Chunk files that may be missing from an array without a look into its folder."""
+"""Up to this many chunk files, an array's folder is not counted here."""
 _MOST_TOLD = 5
 _CHOSEN = {FEATURES: ("float32", "float16", "uint16"), "sensor/values": ("float32", "float16")}
-"""The types of arrays whose type the params choose."""
+"""The allowed types of arrays whose type a param sets."""
 
 
 def array_of(document: dict[str, Any], name: str, where: Path | str, border: Border) -> ArraySpec:
-    """The array that metadata describe; refused where they are not as the contract says."""
+    """The array that the metadata describe; refused where they do not follow the contract."""
     array = border.parse(document, ArrayDocument, where)
     code, *axes = _ARRAYS[name]
     if len(array.shape) != len(axes):
@@ -279,9 +278,9 @@ def array_of(document: dict[str, Any], name: str, where: Path | str, border: Bor
 
 
 def disagreements(specs: Mapping[str, ArraySpec]) -> Iterator[tuple[str, str]]:
-    """The arrays that have another length along an axis than the others, and what is wrong.
+    """The arrays whose length along an axis differs from that of the others, and how.
 
-    Those that hold nothing but positions are believed.
+    Arrays are read in reverse order, and the first array on an axis sets its length.
     """
     lengths = {"key_byte": KEY_BYTES}
     for name in [name for name in reversed(ARRAY_NAMES) if name in specs]:
@@ -302,8 +301,7 @@ def rows_of(specs: Mapping[str, ArraySpec]) -> dict[str, int]:
 def check_agreement(
     root: Path, attrs: StoreAttributes, specs: Mapping[str, ArraySpec], border: Border | None = None
 ) -> None:
-    """Raise `StoreIncomplete` where the arrays of a store do not fit each other, or its attributes
-    say other widths than they have."""
+    """Raise `StoreIncomplete` where a store's arrays do not fit each other or its attributes."""
     border = border or store_border(root)
     for name, what in disagreements(specs):
         raise border.refusal(root / name / "zarr.json", what)

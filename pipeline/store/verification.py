@@ -66,7 +66,7 @@ from pipeline.store.schema import (
     rows_of,
 )
 
-# How a feature row is.
+# The state of a feature row; an index into `FAULTS`.
 SOUND, UNREADABLE, CHANGED, NOT_FINITE = range(4)
 FAULTS = ("", "not in its file", "its bytes do not give its checksum", "NaN or infinity")
 
@@ -77,9 +77,9 @@ _Error = partial(Issue, severity="error")
 class ChunkReport:
     """The state of one chunk file.
 
-    `rows` are those of the array, without padding; `bytes` those that were read; `damage` is wrong
-    with the file as a file. `faults` has an index into `FAULTS` for each feature row, and is empty
-    for another array.
+    `rows` are the rows of the array in it, without padding; `bytes` is how many were read; `damage`
+    says what is wrong with the file as a whole. `faults` has an index into `FAULTS` for each
+    feature row, and is empty for other arrays.
     """
 
     array: str
@@ -92,12 +92,12 @@ class ChunkReport:
 
 @dataclass(frozen=True)
 class Verification:
-    """What was checked of a store and everything that is wrong with it.
+    """What was checked in a store and everything that is wrong with it.
 
-    `inode` is that of the store that was checked: another may have taken its place since. `rows`
-    feature rows could be read; `bytes` of chunk files, padding included. `bad_rows` are the VL rows
-    whose features cannot be used, ascending. `environments` has the software and hardware of
-    ranges of rows, where the store has them.
+    `inode` is that of the checked store: another may have replaced it since. `rows` counts the
+    feature rows that could be read; `bytes` those of chunk files, with padding. `bad_rows` are the
+    VL rows whose features cannot be used, ascending. `environments` has the software and hardware
+    of ranges of rows, if the store has them.
     """
 
     store: Path
@@ -125,7 +125,7 @@ class Verification:
         return {issue.chunk for issue in issues if issue.chunk is not None}
 
     def lines(self) -> list[str]:
-        """For people: everything that is wrong, long lists capped."""
+        """For people: everything that is wrong; long lists are cut."""
         by_kind: dict[str, list[str]] = {}
         for issue in self.issues:
             line = f"{issue.file}: {issue.message}" if issue.file else issue.message
@@ -133,7 +133,7 @@ class Verification:
         return [line for kind, lines in by_kind.items() for line in capped(lines, f"of {kind}")]
 
     def summary(self) -> str:
-        """For people: how much was checked, how fast."""
+        """For people: how much was checked, and how fast."""
         return (
             f"{self.store}: checked {self.rows} feature rows, {size(self.bytes)} of files, in "
             f"{self.seconds:.1f} s ({self.bytes / 1e9 / max(self.seconds, 1e-9):.2f} GB/s)"
@@ -145,12 +145,12 @@ def verify(path: Path, threads: int, workers: int | str = 0) -> Verification:
 
     `workers` is 0 for `threads` of this process, a number of local dask processes, or the address
     of a scheduler whose workers see the store under the same path. Raises `StoreIncomplete` where
-    there is no finished store, or one that no longer says what it is, `StoreMismatch` where it is
-    an archive or was replaced meanwhile, `ConfigError` where no scheduler answers at the address.
+    there is no finished store, or one that lost its plan, `StoreMismatch` where it is an archive or
+    was replaced meanwhile, `ConfigError` where no scheduler answers at the address.
     """
     begun, inode = time.monotonic(), inode_of(path)
     attributes = find_attributes(path)
-    read_plan(path)  # without one, nothing of it can be kept
+    read_plan(path)  # without a plan, nothing in the store can be kept
     specs, issues = read_arrays(path)
     parsed = None
     try:
@@ -208,7 +208,7 @@ def _check_chunks(
             bar.update(report.bytes)
             reports.append(report)
     if workers and any(report.bytes == 0 and report.path.exists() for report in reports):
-        raise StoreIncomplete(  # a file that is here and not there is no damage
+        raise StoreIncomplete(  # a file only this host sees is not damaged
             f"{path}: expected the workers to see the store under this path, they find no file. "
             "Put it on a file system that they share, or set verify.workers=0."
         )
@@ -221,8 +221,8 @@ def _index(
     specs: Mapping[str, ArraySpec],
     reports: Sequence[ChunkReport],
 ) -> FeatureStore | None:
-    """A store of episodes, clocks and positions alone, by which rows are named; None where these
-    are damaged. Raises `StoreIncomplete` where they do not fit each other."""
+    """A store with only the episodes, clocks and positions, to name rows in messages; None where
+    these are damaged. Raises `StoreIncomplete` where they do not fit each other."""
     names = {name for name in specs if name.startswith("episode/") or name.endswith("/time")}
     names |= POSITIONS.keys()
     if any(report.damage for report in reports if report.array in names):
@@ -236,7 +236,7 @@ def _index(
 
 
 def read_arrays(root: Path) -> tuple[dict[str, ArraySpec], list[Issue]]:
-    """The arrays whose metadata can be read and are as the contract says, and what is not."""
+    """The arrays with sound metadata, and an issue for each of the others."""
     specs: dict[str, ArraySpec] = {}
     issues: list[Issue] = []
     for name in ARRAY_NAMES:
@@ -267,7 +267,7 @@ def check_chunk(
     file = read_chunk(path, spec, judge, sealed_trailer(seal, array, chunk))
     if array == FEATURES and (
         CHECKSUMS not in specs or find_damage(root, [specs[CHECKSUMS]], seal)
-    ):  # where their checksums are lost, rows are as good as their file
+    ):  # without checksums, rows are as sound as their file
         faults[np.isin(faults, (SOUND, CHANGED))] = CHANGED if file.damage else SOUND
     return ChunkReport(array, path, rows, file.bytes, file.damage, faults)
 
@@ -277,8 +277,8 @@ def _judge_rows(
 ) -> NDArray[np.int64]:
     """The faults (row,) of feature rows (row, slot, dim) from `start`, indices into `FAULTS`.
 
-    A NaN in an invalid slot is no fault. Where checksums cannot be read, none is right; where the
-    validity cannot be read, every slot is valid.
+    A NaN in an invalid slot is no fault. Where checksums cannot be read, no row counts as
+    unchanged; where the validity cannot be read, every slot counts as valid.
     """
     stop = start + len(features)
     try:
@@ -297,14 +297,14 @@ def _judge_rows(
 def strange_files(
     root: Path, specs: Mapping[str, ArraySpec], golden: Collection[Path] | None
 ) -> Iterator[Issue]:
-    """Files that have no place in a store; `golden` are those of its golden rows, None where they
-    are not known."""
+    """Files that have no place in a store; `golden` are the files of its golden rows, None where
+    they are not known."""
     expected = {*(golden or ())} | {
         root / place / "zarr.json" for place in ("", *GROUPS, *ARRAY_NAMES)
     }
     expected |= {path for spec in specs.values() for path in chunk_paths(root, spec)}
     unjudged = {*ARRAY_NAMES} - {*specs} | ({GOLDEN} if golden is None else set[str]())
-    # What a replacement that was stopped left there: the next extraction removes it.
+    # The next extraction removes these leftovers of a stopped replacement.
     unjudged |= {name for name in (REPLACED, KNOWN) if STORE.owns(root / name)}
     prefixes = tuple(f"{root / name}/" for name in unjudged)
     files = (Path(folder) / file for folder, _, names in os.walk(root) for file in names)
@@ -315,21 +315,22 @@ def strange_files(
 
 
 def _strange_to_zarr(root: Path, issues: Sequence[Issue]) -> Iterator[Issue]:
-    """Documents that zarr itself cannot open, and that no issue names yet.
+    """Documents that zarr itself cannot open and that no issue names yet.
 
-    Each alone in a group: beside it may lie one that is a pipe, for whose end zarr would wait.
+    Each is opened alone in a group in memory, because zarr would wait for a neighbour that is a
+    pipe.
     """
-    known = " ".join(f"{issue.file} {issue.message}" for issue in issues)
+    reported = " ".join(f"{issue.file} {issue.message}" for issue in issues)
     border = store_border(root)
-    there = (
+    documents = (
         Path(folder, "zarr.json") for folder, _, names in os.walk(root) if "zarr.json" in names
     )
-    for document in sorted(path for path in there if str(path) not in known):
+    for document in sorted(path for path in documents if str(path) not in reported):
         try:
             raw = cpu.Buffer.from_bytes(border.read_bytes(document))
             with border.foreign(document, "zarr cannot open it"):
                 node = zarr.open_group(MemoryStore({"its/zarr.json": raw}), mode="a")["its"]
-                _ = isinstance(node, zarr.Group) and [*node.members()]  # of what it says itself
+                _ = isinstance(node, zarr.Group) and [*node.members()]  # that its own metadata list
         except StoreIncomplete as error:
             yield _metadata_issue(root, str(error))
 
@@ -357,7 +358,7 @@ def _run_on_cluster(
         if isinstance(workers, str):
             client = stack.enter_context(client_of(workers, "verify.workers"))
         else:
-            # Of one thread each: checksums hold the interpreter's lock.
+            # One thread per process: checksums hold the interpreter's lock.
             cluster = stack.enter_context(private_cluster(workers, threads=1))
             client = stack.enter_context(Client(cluster, set_as_default=False))
         futures = [client.submit(check, pure=False) for check in checks]
@@ -366,7 +367,7 @@ def _run_on_cluster(
 
 
 def _issues(report: ChunkReport, spec: ArraySpec, store: FeatureStore | None) -> Iterator[Issue]:
-    """The damage of a chunk file, and each run of feature rows with one fault."""
+    """The damage of a chunk file, and each run of feature rows with the same fault."""
     rows, stream = report.rows, report.array.partition("/")[0]
     if report.damage:
         where = f"rows {rows.start} to {rows.stop - 1} of {spec.name}{_name(store, stream, rows)}"

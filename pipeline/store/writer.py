@@ -1,13 +1,13 @@
 """Build a store beside its target, row by row, so that a kill at any instant loses little.
 
-A build lives in `<name>.zarr.part`. What is known beforehand (streams, ticks, episodes) is written
-first, with its checksums; then feature rows with `pwrite` and `fdatasync`, and only then their keys
-and checksums. A row counts as done when its checksum is not 0. Sealing compares the streams with
-their trailers, writes those of the feature rows, which make plain zarr accept the chunks, and one
-rename puts the build in its place.
+A build is in `<name>.zarr.part`. Data known beforehand (streams, ticks, episodes) are written
+first, with their checksums; then feature rows with `pwrite` and `fdatasync`, and only then their
+keys and checksums. A row is done when its checksum is not 0. Sealing compares the streams with
+their trailers and writes the trailers of the feature rows, so that plain zarr accepts the chunks;
+then one rename puts the build in its place.
 
-With which software and hardware each feature row was computed is recorded, not part of its
-identity: while a store is built, as a number a row in a file of its own, which sealing folds into
+The software and hardware that computed each feature row are recorded, but are not part of the row's
+identity. A build keeps them as one number per row in a separate file, which sealing turns into
 ranges of rows in the store's attributes.
 """
 
@@ -42,7 +42,7 @@ Rows = Sequence[int] | NDArray[np.int64]
 
 
 def environment_at(ranges: Sequence[Mapping[str, Any]], row: int) -> dict[str, Any]:
-    """What a row was computed with, by the ranges of a store; empty where it is not noted."""
+    """The environment of a row, from the ranges of a store; empty where it is not recorded."""
     noted = next((noted for noted in ranges if row in range(*noted["rows"])), {})
     return {name: value for name, value in noted.items() if name != "rows"}
 
@@ -50,7 +50,7 @@ def environment_at(ranges: Sequence[Mapping[str, Any]], row: int) -> dict[str, A
 def environment_runs(
     ranges: Sequence[Mapping[str, Any]], rows: NDArray[np.int64]
 ) -> Iterator[tuple[dict[str, Any], range]]:
-    """Consecutive rows among these, which ascend, that were computed in one environment."""
+    """Runs of consecutive rows of one environment; `rows` must ascend."""
     edges = np.searchsorted(rows, [edge for noted in ranges for edge in noted["rows"]])
     gaps = np.flatnonzero(np.diff(rows) != 1) + 1
     for run in np.split(rows, np.union1d(edges, gaps).astype(np.int64)):
@@ -59,7 +59,7 @@ def environment_runs(
 
 
 class EnvironmentLog:
-    """The environments of a build's rows, kept beside its arrays until it is sealed."""
+    """The environments of a build's rows, kept beside its arrays until sealing."""
 
     def __init__(self, part: Path) -> None:
         self._listed = part / ".environments.json"
@@ -68,11 +68,11 @@ class EnvironmentLog:
 
     @property
     def noted(self) -> bool:
-        """Whether there is anything to fold."""
+        """Whether any environment is recorded."""
         return self._listed.exists()
 
     def index(self, environment: Mapping[str, Any]) -> int:
-        """The number of an environment, a new one if it is new."""
+        """The number of an environment; a new environment gets a new number."""
         known = self._known()
         if environment not in known:
             known.append(dict(environment))
@@ -82,7 +82,7 @@ class EnvironmentLog:
         return known.index(dict(environment))
 
     def note(self, start: int, count: int, number: int) -> None:
-        """Say with which environment a run of rows was computed."""
+        """Record the environment that a run of rows was computed with."""
         descriptor = os.open(self._of_row, os.O_WRONLY | os.O_CREAT, 0o644)
         try:
             os.pwrite(descriptor, np.full(count, number, "<u2").tobytes(), start * 2)
@@ -103,7 +103,7 @@ class EnvironmentLog:
         return ranges
 
     def remove(self) -> None:
-        """Forget it; a kill between the two leaves nothing that would be folded again."""
+        """Remove the files, the list first, so that a kill in between leaves nothing to read."""
         for path in (self._listed, self._of_row, self._temporary):
             path.unlink(missing_ok=True)
 
@@ -116,7 +116,7 @@ class EnvironmentLog:
 class StoreBuild:
     """An unfinished store.
 
-    `plan` names what it will hold; only a build of the same plan is continued.
+    `plan` identifies what it will hold; only a build of the same plan is continued.
     """
 
     def __init__(self, target: Path, specs: Mapping[str, ArraySpec], plan: str) -> None:
@@ -128,19 +128,19 @@ class StoreBuild:
         self._environments = EnvironmentLog(self.part)
 
     def create(self) -> None:
-        """Begin from nothing: metadata of every array, then the space for its rows."""
+        """Begin from nothing: make an empty part with the metadata of every array."""
         with disk_full_named(self.part):
             begin_build(self.target)
             for spec in self.specs.values():
                 spec.create(self.part)
 
     def allocate(self) -> None:
-        """Reserve the space of everything that is not linked."""
+        """Reserve space for all chunks that are not linked."""
         for name in self.specs:
             self.files(name).allocate()
 
     def linkable(self, name: str, source_spec: ArraySpec, rows: int) -> int:
-        """How many chunks lie wholly in the first `rows` rows and are cut as the other's are."""
+        """How many chunks lie completely in the first `rows` rows and have the source's layout."""
         spec = self.specs[name]
         cuts = {(cut.chunk_rows, cut.row_bytes, cut.dtype) for cut in (spec, source_spec)}
         if len(cuts) > 1 or name in INCREMENTAL:
@@ -148,9 +148,9 @@ class StoreBuild:
         return min(rows // spec.chunk_rows, spec.chunk_count, source_spec.chunk_count)
 
     def link_unchanged(self, name: str, source: Path, source_spec: ArraySpec, rows: int) -> None:
-        """Take the linkable chunks of the first `rows` rows from a finished store.
+        """Link the linkable chunks of the first `rows` rows from a finished store.
 
-        One that does not give its trailer is left to be written anew.
+        A chunk that does not give its trailer is not linked, but written anew.
         """
         for chunk in range(self.linkable(name, source_spec, rows)):
             path = chunk_path(source, source_spec, chunk)
@@ -164,8 +164,8 @@ class StoreBuild:
     def finish_layout(
         self, attributes: Mapping[str, Any], vl_attributes: Mapping[str, Any]
     ) -> None:
-        """Write the checksums of streams, ticks and episodes, note the attributes and, as the last
-        thing, the plan: from here on the build resumes."""
+        """Write the checksums of streams, ticks and episodes, then the attributes with the plan;
+        after that the build can be resumed."""
         for name, files in self._files.items():
             if name in INCREMENTAL:
                 files.sync()
@@ -178,17 +178,17 @@ class StoreBuild:
     def layout_damage(self) -> str | None:
         """What is wrong with streams, ticks, episodes or metadata of a laid-out build, and where.
 
-        None where they are as they were written. Reads all of them.
+        None where they are unchanged. Reads all of them.
         """
         if what := metadata_damage(self.part):
             return f"{self.part / 'zarr.json'}: {what}"
-        known = (spec for name, spec in self.specs.items() if name not in INCREMENTAL)
-        return find_damage(self.part, known)
+        laid_out = (spec for name, spec in self.specs.items() if name not in INCREMENTAL)
+        return find_damage(self.part, laid_out)
 
     def missing(self) -> NDArray[np.int64]:
-        """The feature rows that are not there, in order.
+        """The missing feature rows, in order.
 
-        A row whose bytes do not give its checksum is not there.
+        A row whose bytes do not give its checksum is missing.
         """
         spec, checksums = self.specs[FEATURES], read_rows(self.part, self.specs[CHECKSUMS])
         step = max(1, 2**26 // max(1, spec.row_bytes))
@@ -200,7 +200,7 @@ class StoreBuild:
         return np.flatnonzero(checksums == 0)
 
     def environment_index(self, environment: Mapping[str, Any]) -> int:
-        """Note a set of software and hardware that rows are computed with; returns its number."""
+        """Record the software and hardware that rows are computed with; returns their number."""
         with disk_full_named(self.part):
             return self._environments.index(environment)
 
@@ -211,9 +211,9 @@ class StoreBuild:
         self.mark(rows, keys, self.write_features(rows, features), environment)
 
     def write_features(self, rows: Rows, features: NDArray[Any]) -> NDArray[np.uint32]:
-        """Write feature rows (row, slot, dim) and wait for the disk; their checksums, for `mark`.
+        """Write feature rows (row, slot, dim), wait for the disk; returns checksums for `mark`.
 
-        Another process or host may call it, with rows that nobody else writes.
+        Another process or host may call it for rows that no other process writes.
         """
         features = np.asarray(features)
         for run in _runs(rows):
@@ -224,9 +224,9 @@ class StoreBuild:
     def mark(
         self, rows: Rows, keys: Sequence[bytes], checksums: NDArray[np.uint32], environment: int
     ) -> None:
-        """Say that feature rows are on disk: their keys, their environment, at last the checksums.
+        """Mark feature rows as done: write their environment, keys and, last, checksums.
 
-        For the coordinating process alone.
+        Only the coordinating process may call it.
         """
         names = np.frombuffer(b"".join(keys), np.uint8).reshape(len(rows), -1)
         runs = _runs(rows)
@@ -242,7 +242,7 @@ class StoreBuild:
     def write_golden(self, rows: Iterable[GoldenFrames]) -> int:
         """Keep the golden rows that give the key of their row; returns how many do not.
 
-        For a build whose rows are all there. Raises `DiskFull`.
+        Only for a build that has all its rows. Raises `DiskFull`.
         """
         spec, files = group_attributes(self.part)["feature_spec"], self.files(KEYS)
         rows = list(rows)
@@ -253,15 +253,14 @@ class StoreBuild:
     def seal(self, *, keep: bool = False) -> None:
         """Check every row, write the trailers and put the store in its place.
 
-        To `keep` is to have what was there as `<name>.zarr.previous`.
-        Idempotent: a kill in the middle is mended by running it again. Raises `StoreIncomplete`
-        when rows are missing, or a file is not as it was written.
+        With `keep`, the replaced store becomes `<name>.zarr.previous`. Idempotent: run it again
+        after a kill. Raises `StoreIncomplete` when rows are missing, or a file was changed.
         """
         self.finish()
         self.put_in_place(keep)
 
     def finish(self) -> None:
-        """The first half of `seal`: all of the store is on the disk, still beside its place."""
+        """The first half of `seal`: the complete store is on the disk, still in the part."""
         missing = self.missing()
         if missing.size:
             raise StoreIncomplete(
@@ -282,13 +281,13 @@ class StoreBuild:
             noted = self._environments.noted
             write_seal(self.part, **({"environment": self._environments.ranges()} if noted else {}))
             self._environments.remove()
-        for partial in self.part.rglob("*.partial"):  # of a write that was killed
+        for partial in self.part.rglob("*.partial"):  # a killed write left it
             partial.unlink()
         self.close()
         sync_folders(self.part)
 
     def put_in_place(self, keep: bool = False) -> None:
-        """The second half of `seal`: an instant."""
+        """The second half of `seal`; it takes an instant."""
         put_in_place(self.target, keep)
 
     def close(self) -> None:
@@ -306,14 +305,14 @@ class StoreBuild:
 
 
 def _runs(rows: Rows) -> list[NDArray[np.intp]]:
-    """Where among `rows` each run of consecutive ones stands, in order."""
+    """The indices into `rows` of each run of consecutive rows, in ascending order."""
     order = np.argsort(rows, kind="stable")
     gaps = np.flatnonzero(np.diff(np.asarray(rows, np.int64)[order]) != 1) + 1
     return np.split(order, gaps)
 
 
 def sync_folders(root: Path) -> None:
-    """Wait for every folder and zarr's metadata; data files are synced as they are written."""
+    """Sync every folder and zarr's metadata; data files are synced as they are written."""
     for folder, _, files in os.walk(root):
         sync(Path(folder))
         if "zarr.json" in files:

@@ -149,10 +149,11 @@ def open_run(
 
     It changes nothing of a run but what a kill left half done: a replacement, and a trainer's state
     that a finished run no longer needs. `extra_identity` is what else decides the numbers
-    (`FeatureSource.identity`); `section` is the section of the params that errors name. A finished run with a damaged checkpoint counts as new:
-    it is trained again and then replaced. Raises `CheckpointMismatch` where an unfinished run with
-    a checkpoint saw other features or streams, `CheckpointIncomplete` where its `run.json` is
-    damaged, and `ConfigError` where no training wrote the output.
+    (`FeatureSource.identity`); `section` is the section of the params that errors name. A finished
+    run with a damaged checkpoint counts as new: it is trained again and then replaced. Raises
+    `CheckpointMismatch` where an unfinished run with a checkpoint saw other features or streams,
+    `CheckpointIncomplete` where its `run.json` is damaged, and `ConfigError` where no training
+    wrote the output.
     """
     output, identity = params.output, run_identity(params, store, extra_identity)
     part = _part(output)

@@ -1,9 +1,10 @@
-"""A frame -> the same scene seen a little otherwise: turned, cropped, in other light.
+"""A frame -> the same scene, a little different: rotated, cropped, in other light.
 
-What is drawn depends on the row's key, the view and the variant alone, through a hash and not a
+The change is drawn from a hash of the seed, the row's key, the view and the variant, not from a
 generator's state: the same frames get the same variants in any batch, order or process, with any
-version of numpy. Each camera has a draw of its own, as each is mounted, knocked and exposed on its
-own: a turn that all of them share would be the arm's motion, which the action has to answer.
+version of numpy. Each camera has its own draw, because each is mounted, knocked and exposed
+separately. A rotation shared by all cameras would look like a motion of the arm, to which the
+action must respond.
 """
 
 import hashlib
@@ -18,7 +19,7 @@ from PIL import Image
 from pipeline.base.config import AugmentationParams
 
 _LUMA = np.array([0.299, 0.587, 0.114])
-"""Of ITU-R BT.601, as Pillow's grey."""
+"""Weights of ITU-R BT.601, as in Pillow's grey."""
 
 
 @dataclass(frozen=True)
@@ -26,11 +27,11 @@ class Augmentation:
     """How one camera's frame is changed in one variant of a row."""
 
     rotation_deg: float
-    """About the frame's centre, counter-clockwise as one sees it."""
+    """Rotation about the frame's centre, counter-clockwise in the image."""
     side: float
-    """Side of the crop, as a share of the turned frame's; it is stretched back to the whole."""
+    """Side of the crop, as a share of the frame's side; the crop is stretched back to full size."""
     offset: tuple[float, float]
-    """Of the crop's centre to the right and down, as shares of the frame's width and height."""
+    """Shift of the crop's centre right and down, as shares of the frame's width and height."""
     brightness: float
     """Factor of every value."""
     contrast: float
@@ -40,10 +41,10 @@ class Augmentation:
 
     @classmethod
     def drawn(cls, params: AugmentationParams, key: bytes, view: str, variant: int) -> Self:
-        """The change of a view in a variant of the row of this key, uniform within `params`."""
+        """The change of a view in a variant of the row with this key, uniform within `params`."""
         drawn_for = f"{params.seed} {variant} {view}".encode()
         digest = hashlib.blake2b(drawn_for, key=key, digest_size=64).digest()
-        # 53 bits a draw: every float64 step of [0, 1), without rounding up to 1.
+        # 53 bits per draw: every float64 step in [0, 1), never rounded up to 1.
         chances = (int(word) >> 11 for word in np.frombuffer(digest, "<u8"))
         draws = (chance * 2.0**-53 for chance in chances)
 
@@ -64,13 +65,13 @@ class Augmentation:
     def apply(self, frame: NDArray[np.uint8], widened: float = 1.0) -> NDArray[np.uint8]:
         """The changed frame, of the same size; (height, width, 3) RGB.
 
-        `widened` is how much more the frame was stretched in width than in height: what turns is
-        the scene as the camera saw it.
+        `widened` is how much more the frame was stretched in width than in height; the rotation is
+        that of the scene before this stretch.
         """
         return np.asarray(self._coloured(self._moved(frame, widened)))
 
     def _moved(self, frame: NDArray[np.uint8], widened: float) -> Image.Image:
-        """Turned and cropped by one bicubic resampling; beyond its edge the frame is mirrored."""
+        """Rotated and cropped by one bicubic resampling; the frame is mirrored at its edges."""
         if self.rotation_deg == 0 and self.side == 1:
             return Image.fromarray(frame)
         height, width = frame.shape[:2]
@@ -78,7 +79,7 @@ class Augmentation:
         angle = math.radians(self.rotation_deg)
         cos, sin = math.cos(angle), math.sin(angle)
         turn = np.array([[cos, -sin * widened], [sin / widened, cos]])
-        # Where a point of the result lies in the frame: turn @ (point x side + shift) + centre.
+        # A point of the result lies in the frame at turn @ (point x side + shift) + centre.
         shift = np.array(self.offset) * [width, height] - centre * self.side
         corners = np.array([[0, 0], [width, 0], [0, height], [width, height]])
         reached = (corners * self.side + shift) @ turn.T + centre
@@ -94,7 +95,7 @@ class Augmentation:
         )
 
     def _coloured(self, image: Image.Image) -> Image.Image:
-        """Brightness, contrast and saturation in one product and one rounding."""
+        """Brightness, contrast and saturation, by one matrix product and one rounding."""
         if (self.brightness, self.contrast, self.saturation) == (1, 1, 1):
             return image
         levels = np.array(image.convert("L").histogram())

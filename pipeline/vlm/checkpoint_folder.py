@@ -1,5 +1,4 @@
-"""Where a checkpoint or an adapter lies on disk, which of its files decide what it says, and what
-must never run or leave the folder.
+"""The folder of a checkpoint or an adapter: its files, and what must never run or leave it.
 
 transformers and peft read the documents themselves, after the checks of this module.
 """
@@ -30,10 +29,10 @@ ADAPTERS = Border(
 )
 
 _WANTED = ["*.json", "*.safetensors", "*.txt", "*.jinja"]
-"""What is fetched from the hub: never a pickle."""
+"""Files that are downloaded from the hub; never a pickle."""
 
 _DTYPES = {"F32", "F16", "BF16"}
-"""What safetensors calls the dtypes that weights may have."""
+"""The allowed dtypes of weights, in safetensors' names."""
 
 _INDEX = "model.safetensors.index.json"
 
@@ -45,7 +44,7 @@ _REFUSED = {
     "_attn_implementation": "/",
     "_experts_implementation": "/",
 }
-"""Keys of a config by what their values hold: with a slash, a kernel would be fetched and run."""
+"""Refused config keys, if their value has this text; a slash would download and run a kernel."""
 _PLAIN = "weights of float32, float16 or bfloat16 and no code of the checkpoint's own"
 
 
@@ -54,8 +53,8 @@ def resolve_checkpoint(
 ) -> Path:
     """The folder of a checkpoint or an adapter.
 
-    An existing folder is taken as it is and no network is touched. Anything else is a hub id: its
-    cached copy where complete, otherwise a download. Raises `VLMError` when neither is there.
+    An existing folder is used without network access. Anything else is a hub id: its cached copy if
+    that is complete, otherwise a download. Raises `VLMError` when there is neither.
     """
     if folder := folder_here(checkpoint):
         return folder
@@ -69,22 +68,22 @@ def resolve_checkpoint(
 
 
 def folder_here(checkpoint: str) -> Path | None:
-    """The folder of this name, if it is one; whatever the text is."""
+    """The folder of this name; None where there is none, for any text."""
     try:
         folder = Path(checkpoint).expanduser()
         return folder if folder.is_dir() else None
-    except (OSError, RuntimeError, ValueError):  # too long, of no user, not to be encoded
+    except (OSError, RuntimeError, ValueError):  # too long, unknown user, or cannot be encoded
         return None
 
 
 def could_be_hub_id(checkpoint: str) -> bool:
-    """Whether a text has the form of one: an owner and a name."""
+    """Whether a text has the form of a hub id: an owner and a name."""
     parts = checkpoint.split("/")
     return len(parts) == 2 and all(parts) and parts[0][0] not in ".~"
 
 
 def cached_checkpoint(checkpoint: str, revision: str | None) -> Path | None:
-    """The complete copy of a hub id in the hub's local cache, if there is one; no network."""
+    """The complete copy of a hub id in the hub's local cache, or None; uses no network."""
     from huggingface_hub import snapshot_download
     from huggingface_hub.errors import HFValidationError, LocalEntryNotFoundError
 
@@ -94,7 +93,7 @@ def cached_checkpoint(checkpoint: str, revision: str | None) -> Path | None:
         )
     except (LocalEntryNotFoundError, HFValidationError):
         return None
-    # A download that was cut short leaves a folder with holes: it is finished, not trusted.
+    # An interrupted download leaves an incomplete folder: complete it, do not use it.
     return Path(copy) if _is_complete(Path(copy)) else None
 
 
@@ -126,9 +125,9 @@ def _downloaded(checkpoint: str, revision: str | None, setting: str) -> Path:
 
 
 def tuned_on(vlm: VLMParams) -> TunedOn | None:
-    """What the model of `vlm` was tuned on; None where neither checkpoint nor adapter says it.
+    """What the model of `vlm` was tuned on; None where neither checkpoint nor adapter says.
 
-    Raises `VLMError` where one is missing, `CheckpointIncomplete` where what it says is damaged.
+    Raises `VLMError` where a folder is missing, `CheckpointIncomplete` where its file is damaged.
     """
     folders = [resolve_checkpoint(vlm.checkpoint, vlm.revision)]
     if vlm.adapter:
@@ -137,7 +136,7 @@ def tuned_on(vlm: VLMParams) -> TunedOn | None:
 
 
 class _Text(Document):
-    """What transformers has a default for that would give other features of the same weights."""
+    """Entries whose default in transformers could give other features with the same weights."""
 
     hidden_size: int
     num_hidden_layers: int
@@ -153,14 +152,14 @@ class _Vision(Document):
 
     @model_validator(mode="after")
     def _defaults_are_the_released(self) -> Self:
-        """Versions before 4.51 leave out what is transformers' default: the released tower's."""
+        """Versions before 4.51 omit transformers' defaults, which fit the released tower."""
         if self.hidden_size != 1280 and None in (self.num_heads, self.fullatt_block_indexes):
             raise ValueError("expected num_heads and fullatt_block_indexes")
         return self
 
 
 class _Config(Document):
-    """config.json, before transformers reads it and fills it up; that of the hub is flat."""
+    """config.json, before transformers adds its defaults; on the hub it is flat."""
 
     model_type: Literal["qwen2_5_vl"]
     text_config: _Text
@@ -178,8 +177,8 @@ class _WeightIndex(Document):
 
 
 class _AdapterConfig(Document):
-    """adapter_config.json, before peft reads it: other kinds and keys have it import modules, or
-    load models of other folders or of the hub."""
+    """adapter_config.json, before peft reads it. Other kinds and keys would let peft import
+    modules, or load models from other folders or the hub."""
 
     peft_type: Literal["LORA"]
     megatron_config: None = None
@@ -189,10 +188,10 @@ class _AdapterConfig(Document):
 def read_config(folder: Path) -> Any:
     """The checkpoint's `Qwen2_5_VLConfig`, as transformers reads config.json.
 
-    Raises `VLMError` as `check_documents`, and where transformers cannot read it or its sizes do
-    not fit each other, which would fail while features are computed.
+    Raises `VLMError` like `check_documents`, where transformers cannot read it, and where its sizes
+    do not fit each other, which would otherwise fail only when features are computed.
     """
-    from transformers import Qwen2_5_VLConfig  # takes seconds
+    from transformers import Qwen2_5_VLConfig  # takes seconds to import
 
     check_documents(folder)
     path = folder / "config.json"
@@ -223,15 +222,15 @@ def read_config(folder: Path) -> Any:
 
 
 def check_documents(folder: Path) -> None:
-    """Raise `VLMError` unless a checkpoint is a Qwen2.5-VL whose config decides its features, not
-    quantized, without code of its own, document, template or text that is no regular file."""
+    """Raise `VLMError` unless a checkpoint is a Qwen2.5-VL with a complete config, not quantized,
+    without its own code, whose documents, templates and texts are regular files."""
     small_files(folder)
     VLMS.read_json(folder / "config.json", _Config)
     _refuse_code(folder, VLMS)
 
 
 def small_files(folder: Path) -> list[Path]:
-    """Every document, template and text of a folder, sorted; `VLMError` for what is no file."""
+    """Every document, template and text of a folder, sorted; `VLMError` for a non-file."""
     beside = (*folder.glob("*"), *folder.glob("additional_chat_templates/*"))
     files = sorted(path for path in beside if path.suffix in (".json", ".jinja", ".txt"))
     for path in files:
@@ -241,9 +240,9 @@ def small_files(folder: Path) -> list[Path]:
 
 @contextmanager
 def quiet_transformers() -> Generator[None]:
-    """Keep transformers' reports off stderr, and its progress bars unless that is a terminal.
+    """Keep transformers' reports off stderr, and its progress bars too unless that is a terminal.
 
-    What they warn of is checked and raised as `VLMError`.
+    This project checks what they warn of, and raises `VLMError`.
     """
     from transformers.utils import logging
 
@@ -260,7 +259,7 @@ def quiet_transformers() -> Generator[None]:
 
 
 def _refuse_code(folder: Path, border: Border) -> None:
-    """Raise `VLMError` where a checkpoint or an adapter names code of its own, or quantized it."""
+    """Raise `VLMError` where a checkpoint or an adapter names its own code, or is quantized."""
     for path in sorted(folder.glob("*config.json")):
         document = border.read_json(path, dict[str, JsonValue])
         for key, value in _entries(document):
@@ -271,7 +270,7 @@ def _refuse_code(folder: Path, border: Border) -> None:
 
 
 def _entries(document: JsonValue) -> Iterator[tuple[str, JsonValue]]:
-    """What stands at any depth of a JSON document, with its key; in a list that is empty."""
+    """Each (key, value) at any depth of a JSON document; the key is '' in a list."""
     inside = document if isinstance(document, list | dict) else ()
     for entry in inside.items() if isinstance(inside, dict) else (("", item) for item in inside):
         yield entry
@@ -279,10 +278,10 @@ def _entries(document: JsonValue) -> Iterator[tuple[str, JsonValue]]:
 
 
 def tensor_shapes(files: Sequence[Path], border: Border = VLMS) -> dict[str, list[int]]:
-    """Shape of each tensor of those of the files that hold weights; no weight is read.
+    """Shape of each tensor in the safetensors files among these; reads no weight.
 
-    Raises `VLMError` where a file is cut off or damaged, where a tensor stands twice, and where one
-    is no float, which would be loaded as if it were one.
+    Raises `VLMError` where a file is truncated or damaged, where two files have a tensor of the
+    same name, and where a tensor is not float, because it would be loaded as if it were.
     """
     shapes: dict[str, list[int]] = {}
     for path in (path for path in files if path.suffix == ".safetensors"):
@@ -303,7 +302,7 @@ def tensor_shapes(files: Sequence[Path], border: Border = VLMS) -> dict[str, lis
 def weight_files(folder: Path) -> list[Path]:
     """Every file that decides the weights, sorted: config.json, safetensors and their index.
 
-    Raises `VLMError` where there is none, where the index names a file that is missing, where
+    Raises `VLMError` where there are no weights, where the index names a missing file, where
     transformers would load other files than these, where a file is damaged, and where weights are
     not float32, float16 or bfloat16.
     """
@@ -314,7 +313,7 @@ def weight_files(folder: Path) -> list[Path]:
         )
     files, whole = _present_weights(folder), folder / "model.safetensors"
     shards = {path for path in files if path.suffix == ".safetensors"}
-    # transformers loads model.safetensors and passes the index over.
+    # transformers loads model.safetensors and ignores the index.
     if folder / _INDEX in files and whole.exists() and shards != {whole}:
         raise VLMError(
             f"{folder}: ambiguous: it has both {whole.name} and {_INDEX}, which names other "
@@ -353,10 +352,10 @@ def tokenizer_files(folder: Path) -> list[Path]:
 
 
 def adapter_files(folder: Path) -> list[Path]:
-    """The files that decide what an adapter adds, sorted.
+    """The files that decide an adapter's effect, sorted.
 
-    Raises `VLMError` where one is missing or damaged, where it is no LoRA or names code of its own,
-    or its weights are no floats.
+    Raises `VLMError` where one is missing or damaged, where the adapter is not LoRA or names its
+    own code, and where its weights are not float.
     """
     files = [folder / "adapter_config.json", folder / "adapter_model.safetensors"]
     ADAPTERS.read_json(files[0], _AdapterConfig)

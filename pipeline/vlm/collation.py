@@ -19,28 +19,28 @@ from pipeline.vlm.slots import Slot
 from pipeline.vlm.vision import TowerPlan, VisionTower, sent
 
 _KEPT = 8
-"""Arrangements that are remembered."""
+"""Most arrangements that are kept."""
 
 _STEP = 64
-"""Static lengths are multiples of it."""
+"""Static lengths are multiples of this."""
 
 _SAMPLE = 1024
-"""Values of an image that are looked at before images are compared as a whole."""
+"""Values of an image that are compared before complete images are."""
 
 
 @dataclass(frozen=True)
 class Arrangement:
-    """What follows from the rows' layouts alone, on the model's device."""
+    """The tensors that depend only on the rows' layouts, on the model's device."""
 
     length: int
     real: Bool[Tensor, "batch token"] | None
-    """Which tokens are not padding; None where none is."""
+    """Which tokens are not padding; None where there is no padding."""
     positions: Int64[Tensor, "3 batch token"]
     image_tokens: Int64[Tensor, " image_token"]
     """Indices of the image tokens in the flattened (batch x token)."""
     weights: Float[Tensor, "batch place token"]
     valid: Bool[Tensor, "batch place"]
-    """Which places have a token at all; on the CPU."""
+    """Which places have at least one token; on the CPU."""
 
 
 @dataclass(frozen=True)
@@ -52,13 +52,13 @@ class TokenBatch:
     pixels: UInt8[Tensor, "image height width 3"]
     """Each distinct image once."""
     plan: TowerPlan | None
-    """How the tower takes them; None where there is no image."""
+    """The tower's plan for these images; None where there is no image."""
     shown: Int64[Tensor, " image_token"]
-    """For each image token of the batch, which of the tower's it is."""
+    """For each image token of the batch, the index of the tower's token."""
 
 
 class Collator:
-    """Makes batches; what layouts and image counts decide is worked out once."""
+    """Makes batches; whatever depends only on layouts and image counts is computed once."""
 
     def __init__(
         self,
@@ -68,8 +68,8 @@ class Collator:
         tower: VisionTower,
         static: bool = False,
     ) -> None:
-        """With `static`, batches of as many rows of one layout have one shape: images that are
-        shown twice stay, and lengths are rounded up."""
+        """With `static`, batches of equally many rows of one layout have one shape: repeated images
+        are not merged, and lengths are rounded up."""
         self._model, self._tower = model, tower
         self._settings, self._places, self._static = settings, places, static
         self._positions: dict[TokenLayout, Int64[Tensor, "3 token"]] = {}
@@ -129,7 +129,7 @@ class Collator:
         )
 
     def _rope_positions(self, layout: TokenLayout) -> Int64[Tensor, "3 token"]:
-        """Time, height and width position of each token; computed once a layout, on the CPU."""
+        """Time, height and width position of each token; computed once per layout, on the CPU."""
         if layout not in self._positions:
             kinds = torch.zeros(1, layout.length, dtype=torch.int64)
             kinds[0, torch.from_numpy(layout.image_tokens())] = 1
@@ -143,14 +143,14 @@ class Collator:
         return self._positions[layout]
 
     def _pinned(self, shape: tuple[int, ...], dtype: torch.dtype) -> Tensor:
-        """Memory that the device can copy from while both go on."""
+        """Memory from which the device can copy while the host goes on."""
         return torch.empty(shape, dtype=dtype, pin_memory=self._model.device.type == "cuda")
 
 
 def unique(images: Sequence[NDArray[np.uint8]]) -> tuple[list[NDArray[np.uint8]], list[int]]:
-    """The images that differ, in order, and which of them each image is.
+    """The distinct images, in order, and the index of each image among them.
 
-    Equal means every value: a sample only saves most comparisons.
+    Equal images have all values equal; a sample of values only saves most comparisons.
     """
     distinct: list[NDArray[np.uint8]] = []
     alike: dict[bytes, list[int]] = defaultdict(list)

@@ -1,9 +1,8 @@
 """A small Qwen2.5-VL with random weights, written locally in the hub's own format.
 
-Same config, tokenizer, chat template, image processor and safetensors layout as the released
-checkpoints, so the demo runs through the code that real weights run through. It has learned
-nothing; its random projections still carry what stands where in the image, which the `grid`
-pooling keeps.
+It has the same config, tokenizer, chat template, image processor and safetensors layout as the
+released checkpoints, so the demo runs the same code as real weights. It has learned nothing, but
+its random projections still show where things are in the image, and the `grid` pooling keeps that.
 """
 
 import json
@@ -23,8 +22,8 @@ from pipeline.base.files import OutputKind, replace_folder
 from pipeline.vlm.checkpoint_folder import quiet_transformers
 
 _FILES = Path(__file__).with_name("demo")
-"""What the checkpoint is made from: its own small files, its architecture, and the words that the
-tokenizer learns its merges from."""
+"""The sources of the checkpoint: its own small files, its architecture, and the words from which
+the tokenizer learns its merges."""
 
 _VOCABULARY = 1536
 
@@ -32,14 +31,14 @@ _WORDS = (
     r"(?i:'s|'t|'re|'ve|'m|'ll|'d)|[^\r\n\p{L}\p{N}]?\p{L}+|\p{N}| ?[^\s\p{L}\p{N}]+[\r\n]*"
     r"|\s*[\r\n]+|\s+(?!\S)|\s+"
 )
-"""The pattern by which Qwen2's tokenizers split a text into words."""
+"""The pattern with which Qwen2's tokenizers split a text into words."""
 
 
 def write_demo_checkpoint(folder: Path, seed: int = 0) -> None:
-    """Write the demo's checkpoint to `folder`, whole or not at all; same seed, same bytes.
+    """Write the demo's checkpoint to `folder`, completely or not at all; same seed, same bytes.
 
-    One that stood there before is replaced. Raises `DiskFull`, and `ConfigError` where something
-    else stands there.
+    An earlier one there is replaced. Raises `DiskFull`, and `ConfigError` where something else is
+    there.
     """
     replace_folder(folder, partial(_write, seed=seed), DEMO_CHECKPOINT)
 
@@ -50,7 +49,7 @@ def _is_demo(folder: Path) -> bool:
 
 
 DEMO_CHECKPOINT = OutputKind("what the demo wrote", _is_demo)
-"""Called as the demo's other outputs are: it is written into one that is in the making."""
+"""It has the name of the demo's other outputs, because it is written into one of them."""
 
 
 def _write(folder: Path, seed: int) -> None:
@@ -81,13 +80,13 @@ def _train_tokenizer() -> Tokenizer:
         initial_alphabet=sorted(pre_tokenizers.ByteLevel.alphabet()),
     )
     tokenizer.train_from_iterator(_corpus(), trainer)
-    # Behind the vocabulary, as in the released checkpoints.
+    # After the vocabulary, as in the released checkpoints.
     tokenizer.add_special_tokens([AddedToken(token, special=True) for token in special])
     return tokenizer
 
 
 def _corpus() -> Iterator[str]:
-    """The same sentences in every run: words walk at strides, so that neighbours vary."""
+    """The same sentences in every run; several strides through the words vary the neighbours."""
     vocabulary = (_FILES / "words.txt").read_text(encoding="utf-8").split()
     count = len(vocabulary)
     for stride in (1, 7, 31, 89):
@@ -98,9 +97,10 @@ def _corpus() -> Iterator[str]:
 
 
 def _build_model(seed: int) -> Qwen2_5_VLForConditionalGeneration:
-    """Random weights that keep the scale of what passes through them.
+    """Random weights that keep the scale of their input.
 
-    Drawn by numpy, tensor by tensor: the same on every machine, whatever order torch builds in.
+    numpy draws them tensor by tensor: they are the same on every machine, in whatever order torch
+    builds.
     """
     config = json.loads((_FILES / "config.json").read_text(encoding="utf-8"))
     with torch.random.fork_rng(devices=[]):

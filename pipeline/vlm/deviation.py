@@ -1,4 +1,4 @@
-"""How far features computed again are from the stored ones, and how far they may be."""
+"""How far recomputed features are from the stored ones, and how far they may be."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -13,21 +13,21 @@ from numpy.typing import NDArray
 # Measured with the demo checkpoint on a CPU, against batches of 8 on one thread: batches of 1 and
 # 3, two threads and eager attention move a number of 16 rows x 49 slots x 128 by at most 7e-6 in
 # float32, 0.012 in float16 and 0.070 in bfloat16 (two of its steps after four layers). Deeper
-# models gather more, so a few times that is allowed, and in float32, where nothing is lost by it,
-# a hundred times, for GPUs sum in other orders. What is wrong in earnest is far beyond: another
-# frame, prompt or weight moves numbers by about their own size.
+# models deviate more, so a few times that is allowed, and in float32, where that is still small, a
+# hundred times, because GPUs sum in other orders. A real fault deviates far more: another frame,
+# prompt or weight changes numbers by about their own size.
 TOLERANCES = {"float32": 1e-3, "float16": 5e-2, "bfloat16": 3e-1}
 
 
 def tolerance_of(spec: Mapping[str, Any]) -> float:
-    """What is tolerated of features of this spec, relative to the root mean square of a slot."""
+    """The tolerance for features of this spec, relative to the root mean square of a slot."""
     return max(TOLERANCES[spec[dtype]] for dtype in ("compute_dtype", "storage_dtype"))
 
 
 @dataclass(frozen=True)
 class SlotDeviations:
     """The largest deviation of each slot of a row, (slot,): absolute, and `relative` to the root
-    mean square of the stored slot; infinite or NaN where no number is."""
+    mean square of the stored slot; infinite or NaN where features are not finite."""
 
     absolute: NDArray[np.float64]
     relative: NDArray[np.float64]
@@ -38,16 +38,16 @@ class SlotDeviations:
         return int(np.argmax(np.nan_to_num(self.relative, nan=np.inf)))
 
     def beyond(self, tolerance: float) -> list[int]:
-        """The slots that deviate more, the worst first; a NaN always does."""
+        """The slots that deviate more, the worst first; includes every NaN."""
         order = np.argsort(-np.nan_to_num(self.relative, nan=np.inf), kind="stable")
         return [int(slot) for slot in order if not self.relative[slot] <= tolerance]
 
 
 def slot_deviations(stored: NDArray[Any], today: NDArray[Any]) -> SlotDeviations:
-    """Of the features (slot, dim) of a row."""
+    """The deviations of a row's features (slot, dim)."""
     numbers = stored.astype(np.float64)
     apart = np.abs(today.astype(np.float64) - numbers).max(axis=-1)
     rms = np.sqrt(np.mean(numbers**2, axis=-1))
     with np.errstate(divide="ignore", invalid="ignore"):
-        relative = np.where(apart == 0, 0.0, apart / rms)  # a slot of zeros may stay one
+        relative = np.where(apart == 0, 0.0, apart / rms)  # a slot of zeros has no deviation
     return SlotDeviations(apart, relative)

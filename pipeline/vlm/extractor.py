@@ -1,4 +1,4 @@
-"""Prepared rows -> pooled features, differentiable: what the frozen and the live model share."""
+"""Prepared rows -> pooled features, differentiable; shared by the frozen and the live model."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import lru_cache
@@ -17,7 +17,7 @@ from pipeline.vlm.slots import Slot
 from pipeline.vlm.vision import VisionTower
 
 _SHAPES = 64
-"""Of batches, that are compiled: sizes that are tried, times prompt lengths, times views."""
+"""Most batch shapes that are compiled: tried sizes times prompt lengths times views."""
 
 
 def layers_needed(slots: Iterable[Slot]) -> int:
@@ -26,10 +26,10 @@ def layers_needed(slots: Iterable[Slot]) -> int:
 
 
 class Extractor:
-    """Collates rows, runs an inner `Qwen2_5_VLModel` and pools what its layers give.
+    """Collates rows, runs an inner `Qwen2_5_VLModel` and pools its layers' outputs.
 
-    Whether gradients flow, and in which precision, is the caller's. Between a batch's first tensor
-    and its features nothing waits for the device.
+    The caller decides whether gradients flow, and in which precision. Nothing waits for the device
+    between a batch's first tensor and its features.
     """
 
     def __init__(
@@ -41,20 +41,20 @@ class Extractor:
     ) -> None:
         """`model` may be cut after the last layer that a slot reads.
 
-        With `compiled`, vision and text are each compiled as a whole, for static shapes.
+        With `compiled`, vision and text are each compiled completely, for static shapes.
         """
         self.model = model
         self._settings = settings
-        # Slots repeat the same places for every (layer, norm): pooled with one set of weights.
+        # Every (layer, norm) has the same places, so one set of pooling weights is enough.
         self._reads = tuple(dict.fromkeys((slot.layer, slot.norm) for slot in slots))
         places = slots[: len(slots) // len(self._reads)]
         self._tower = VisionTower(model.visual, settings.grid)
         self._collator = Collator(model, settings, places, self._tower, static=compiled)
         self._compiled: tuple[Callable[..., Tensor], ...] = ()
         if compiled:
-            from torch._dynamo import config  # takes a second
+            from torch._dynamo import config  # takes a second to import
 
-            # Past this many shapes dynamo would go on uncompiled, and hardly say so.
+            # After more shapes than this, dynamo would continue uncompiled, almost silently.
             config.recompile_limit = _SHAPES
             mode = "reduce-overhead" if model.device.type == "cuda" else None
             parts = (self._tower.__call__, self._read)
@@ -63,22 +63,22 @@ class Extractor:
     def extract(
         self, rows: Sequence[PreparedRow]
     ) -> tuple[Float[Tensor, "batch slot dim"], Bool[Tensor, "batch slot"]]:
-        """Features of each row in float32 on the model's device; which are valid, on the CPU."""
+        """Features of each row, float32 on the model's device, and which are valid, on the CPU."""
         batch = self.collate(rows)
         return self.features(batch), self.valid(batch)
 
     def collate(self, rows: Sequence[PreparedRow]) -> TokenBatch:
-        """The rows as `features` takes them, sent to the model's device without waiting."""
+        """The batch for `features`, sent to the model's device without waiting."""
         return self._collator.collate(rows)
 
     def valid(self, batch: TokenBatch) -> Bool[Tensor, "batch slot"]:
-        """Which slots have a token at all; on the CPU."""
+        """Which slots have at least one token; on the CPU."""
         return batch.arrangement.valid.repeat(1, len(self._reads))
 
     def features(self, batch: TokenBatch) -> Float[Tensor, "batch slot dim"]:
         """The slots of each row, in float32 on the model's device.
 
-        What a compiled extractor gives is overwritten by its next batch.
+        A compiled extractor overwrites its result with its next batch.
         """
         if self._compiled:
             torch.compiler.cudagraph_mark_step_begin()
@@ -95,11 +95,12 @@ class Extractor:
     def _masks(self, embedded: Float[Tensor, "batch token dim"]) -> Mapping[str, Tensor | None]:
         """The mask of each kind of layer; None where the kernel itself is causal.
 
-        Attention is causal and padding stands last, so no real token sees any: a mask for it would
-        only cost its memory and the fast causal kernel.
+        Attention is causal and padding comes last, so no real token sees padding: a mask for it
+        would only cost memory and prevent the fast causal kernel.
         """
         text = self.model.language_model
-        # By position, as releases differ in a name: no padding mask, no cache, plain positions.
+        # Passed by position, because a name differs between releases: no padding mask, no cache,
+        # plain positions.
         given = (text.config, embedded, None, None, None)
         masks: dict[str, Any] = {"full_attention": create_causal_mask(*given)}
         if text.has_sliding_layers:
@@ -114,7 +115,7 @@ class Extractor:
         weights: Float[Tensor, "batch place token"],
         real: Bool[Tensor, "batch token"] | None,
     ) -> Float[Tensor, "batch slot dim"]:
-        """Run the layers, pooling what each gives as soon as it gives it: none is kept alive."""
+        """Run the layers and pool each output at once, so that none is kept in memory."""
         text = self.model.language_model
         rotary = text.rotary_emb(embedded, positions)
         read: dict[tuple[int, bool], Tensor] = {}
@@ -125,7 +126,8 @@ class Extractor:
             for key in self._reads:
                 if key[0] == number:
                     tokens = text.norm(hidden) if key[1] else hidden
-                    # Sums over thousands of tokens stay in float32 whatever the caller's autocast.
+                    # Sums over thousands of tokens stay in float32, whatever autocast the caller
+                    # uses.
                     with torch.autocast(tokens.device.type, enabled=False):
                         read[key] = pool(tokens, weights, real)
         return torch.cat([read[key] for key in self._reads], dim=1)
@@ -138,8 +140,8 @@ def patchify(
 
     The layout is that of transformers' Qwen2-VL image processor.
 
-    Patches stand in the tower's order: block by block of merge size x merge size, row-major; the
-    values of a patch are (channel, time, y, x), with the still image repeated over time.
+    Patches are in the tower's order: blocks of merge size x merge size, row-major; the values of a
+    patch are (channel, time, y, x), with the still image repeated over time.
     """
     rows, columns = settings.grid
     merge, patch = settings.merge_size, settings.patch_size
@@ -158,7 +160,7 @@ def patchify(
 def _normalisation(settings: PixelSettings, device: torch.device) -> tuple[Tensor, Tensor]:
     """Scale and offset of each channel (channel, 1, 1), so that one pass rescales and normalises.
 
-    Sent once: sending waits.
+    Cached, because sending them waits for the device.
     """
     mean, std = (
         torch.tensor(values, dtype=torch.float64).reshape(-1, 1, 1)

@@ -1,7 +1,8 @@
-"""What a feature is: its identity, computed without loading a weight.
+"""The identity of a feature, computed without loading a weight.
 
-Two features may stand in one store only if their specs have the same digest. The attention
-backend and library versions are not part of it: they move a feature within the noise of its dtype.
+Two features may be in one store only if their specs have the same digest. The attention backend and
+library versions are not part of the spec, because they change a feature only within the noise of
+its dtype.
 """
 
 import hashlib
@@ -30,16 +31,16 @@ from pipeline.vlm.checkpoint_folder import (
 from pipeline.vlm.slots import Slot, slot_documents, slots_of
 
 EXTRACTOR_VERSION = 1
-"""Raised whenever this code changes what a feature is: the golden-feature test sees to it."""
+"""Raise it whenever this code changes what a feature is; the golden-feature test enforces that."""
 
 AUGMENTATION_VERSION = 1
-"""Raised whenever this code changes what an augmented variant of a frame is."""
+"""Raise it whenever this code changes what an augmented variant of a frame is."""
 
 _WIDTH_OF_3B = 2048
-"""Of the hidden states of Qwen2.5-VL-3B."""
+"""Width of the hidden states of Qwen2.5-VL-3B."""
 
 _MANY_LAYERS = 10_000
-"""How many layers a model has decides which of them are read, not how many slots."""
+"""A stand-in for an unknown number of layers, on which the number of slots does not depend."""
 
 _PLACEHOLDER_INSTRUCTION = "…"
 _READS_CHECKPOINTS = ("transformers", "tokenizers", "huggingface-hub", "jinja2")
@@ -54,13 +55,13 @@ class FeatureSpec:
     digest: str
     """Hex digest of the document."""
     slots: tuple[Slot, ...]
-    """Of one variant."""
+    """The slots of one variant."""
     views: tuple[str, ...]
     dim: int
     image_size: tuple[int, int]
     """Final height and width of every frame, in pixels."""
     variants: int
-    """How many times a row holds the slots: the frames as they are, then augmented."""
+    """How many times a row holds the slots: first for the plain frames, then for augmented ones."""
 
     def attrs(self) -> dict[str, Any]:
         """The document with its digest, as a store keeps it."""
@@ -78,12 +79,12 @@ def feature_spec(
     digest_file: Callable[[Path], str],
     remember: Callable[[str, Callable[[], str]], str] | None = None,
 ) -> FeatureSpec:
-    """The spec of features that `vlm` gives for these views, stored as `storage_dtype`.
+    """The spec of the features of `vlm` for these views, stored as `storage_dtype`.
 
-    Reads the checkpoint's small files; `digest_file` gives the content digest of one file and may
-    remember it. `remember` (`ContentDigests.text`) may remember what was read by the digest of all
-    it depends on: then transformers, which takes seconds to import, is not needed again. Raises
-    `VLMError` where the checkpoint is incomplete or `vlm.layers` goes past it.
+    Reads the checkpoint's small files; `digest_file` returns the content digest of one file and may
+    remember it. `remember` (`ContentDigests.text`) may keep the result under the digest of all its
+    inputs; then transformers, which takes seconds to import, is not needed again. Raises `VLMError`
+    where the checkpoint is incomplete or `vlm.layers` goes past it.
     """
     folder = resolve_checkpoint(vlm.checkpoint, vlm.revision)
     ordered = tuple(sorted(set(views)))
@@ -118,9 +119,10 @@ def feature_spec(
 
 
 def feature_shape(vlm: VLMParams, views: Sequence[str]) -> tuple[int, int]:
-    """Slots, and width: what a checkpoint folder says of itself, Qwen2.5-VL-3B's for a hub id.
+    """(slots, width) of the features; for a hub id the width is that of Qwen2.5-VL-3B.
 
-    Raises `VLMError` for what is neither, and for a name in a folder that is here and lacks it.
+    Raises `VLMError` for a checkpoint that is neither a folder nor a hub id, also for a name whose
+    parent is a folder here but that does not exist.
     """
     slots = len(slots_of(vlm, _MANY_LAYERS, views))
     if folder := folder_here(vlm.checkpoint):
@@ -134,7 +136,7 @@ def feature_shape(vlm: VLMParams, views: Sequence[str]) -> tuple[int, int]:
 
 
 def _read(folder: Path, vlm: VLMParams, views: int) -> dict[str, Any]:
-    """What transformers has to read: entries of the document, and the number of layers."""
+    """What only transformers can read: entries of the document, and the number of layers."""
     from pipeline.vlm.processor import PixelSettings, PromptRenderer
 
     renderer, text = PromptRenderer(folder, vlm.prompt), read_config(folder).text_config
@@ -168,7 +170,7 @@ def _read_digest(
 def live_differences(trained: Mapping[str, Any], live: Mapping[str, Any]) -> list[str]:
     """A line for each entry that differs between the spec of a policy and that of a live model.
 
-    How features are stored makes none, nor do augmented variants: a live model gives plain ones.
+    The storage dtype and augmented variants do not count: a live model computes plain features.
     """
     return describe(differences(_as_live(trained), _as_live(live)))
 
@@ -181,7 +183,7 @@ def _as_live(spec: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _augmentation(vlm: VLMParams) -> dict[str, Any]:
-    """What augmented variants are; nothing where there is none, so that no feature is renamed."""
+    """The entries for augmented variants; empty without them, so that old digests stay."""
     if vlm.variants == 1:
         return {}
     how = {"version": AUGMENTATION_VERSION, **vlm.augmentation.model_dump()}

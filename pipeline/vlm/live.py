@@ -1,4 +1,4 @@
-"""The Qwen2.5-VL that learns: features with gradients, and what it has learned on disk."""
+"""The Qwen2.5-VL that learns: it computes features with gradients and saves its weights."""
 
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
@@ -22,9 +22,9 @@ from pipeline.vlm.tuning import load_adapting, load_learning, save_adapter, save
 
 
 def live_spec(vlm: VLMParams, views: Sequence[str]) -> FeatureSpec:
-    """The spec of the features that a live model of `vlm` gives, every file digested anew.
+    """The spec of the features of a live model of `vlm`; reads every file for its digest.
 
-    They are stored nowhere: compare it with that of stored ones by `live_differences`.
+    These features are not stored: compare the spec with that of stored ones by `live_differences`.
     """
     return feature_spec(vlm, "float32", views, file_digest)
 
@@ -36,7 +36,7 @@ _SHOWN = 8
 def refuse_other_features(vlm: VLMParams, trained: Mapping[str, Any], live: FeatureSpec) -> None:
     """Raise `CheckpointMismatch` where features of the spec `trained` are not those of `live`.
 
-    It names each entry that differs, as `live_differences` has it. No weight is needed for it.
+    The error lists the entries of `live_differences`. No weight is loaded.
     """
     if lines := live_differences(trained, live.document):
         more = [f"… and {len(lines) - _SHOWN} more"] if len(lines) > _SHOWN else []
@@ -51,10 +51,10 @@ def refuse_other_features(vlm: VLMParams, trained: Mapping[str, Any], live: Feat
 class LiveVLM(nn.Module):
     """A Qwen2.5-VL that computes the features of `spec` from prepared rows, and may learn.
 
-    What learns has `requires_grad`: nothing, low-rank adapters on the linear layers of the chosen
-    towers, or every weight of those towers, and is held in float32. The rest computes as in
+    The learning weights have `requires_grad` and are float32: none, low-rank adapters on the linear
+    layers of the chosen towers, or every weight of those towers. The rest computes as in
     `FrozenVLM`, so both give the same features within the noise of `vlm.dtype`. In `train()` mode
-    adapters drop out and activations are checkpointed.
+    adapters use dropout and activations are checkpointed.
 
     `copy.deepcopy` with a memo of the frozen parameters shares them.
     """
@@ -82,10 +82,10 @@ class LiveVLM(nn.Module):
     def load(
         cls, vlm: VLMParams, spec: FeatureSpec, tuning: TuningParams, device: str = "auto"
     ) -> "LiveVLM":
-        """The checkpoint of `vlm`, cut after the last layer needed, as `tuning` lets it learn.
+        """The checkpoint of `vlm`, cut after the last layer needed; `tuning` decides what learns.
 
-        With `vlm.adapter`, `lora` goes on learning that adapter; `none` and `full` merge it first.
-        Raises `VLMError` as `FrozenVLM.load` does, where the adapter is not what `tuning` says,
+        With `vlm.adapter`, `lora` continues to train that adapter; `none` and `full` merge it
+        first. Raises `VLMError` like `FrozenVLM.load`, where the adapter does not match `tuning`,
         and for float16, whose gradients underflow.
         """
         target = resolve_device(device)
@@ -106,8 +106,8 @@ class LiveVLM(nn.Module):
             inner = model.base_model.model.model
         if tuning.method != "none" and tuning.gradient_checkpointing:
             inner.activation_checkpointing_enable({"use_reentrant": False})
-            # Image tokens are written into the embeddings in place, which a leaf would refuse;
-            # without re-entrance checkpoints need no input that requires gradients.
+            # Image tokens are written into the embeddings in place, which a leaf that requires
+            # gradients would refuse; non-reentrant checkpoints need no such input.
             inner.disable_input_require_grads()
         extractor = Extractor(inner, PixelSettings.of(vlm), spec.slots)
         live = cls(model.to(target), extractor, spec, vlm, tuning)
@@ -119,18 +119,18 @@ class LiveVLM(nn.Module):
     ) -> tuple[Float[Tensor, "row slot dim"], Bool[Tensor, "row slot"]]:
         """Features of each row in float32 and which slots are valid, on the model's device.
 
-        A slot whose view is missing is zero and invalid; a row is the same, within the compute
-        dtype's noise, whatever rows stand beside it. Computed in `vlm.dtype` whatever autocast
-        the caller is in.
+        A slot whose view is missing is zero and invalid. A row's features do not depend on the
+        other rows, except for the compute dtype's noise. Computes in `vlm.dtype`, whatever autocast
+        the caller uses.
         """
         with self._precision():
             features, valid = self._extractor.extract(rows)
         return features, valid.to(features.device)
 
     def refuse_other_features(self, trained: Mapping[str, Any]) -> None:
-        """Raise `CheckpointMismatch` where features of the spec `trained` are not what this gives.
+        """Raise `CheckpointMismatch` where this model does not compute the features of `trained`.
 
-        As `refuse_other_features`.
+        See the function `refuse_other_features`.
         """
         refuse_other_features(self.vlm, trained, self.spec)
 
@@ -144,11 +144,11 @@ class LiveVLM(nn.Module):
             )
 
     def save(self, folder: Path) -> None:
-        """Write what has been learned into `folder`, made if need be.
+        """Write the learned weights into `folder`, which is created if needed.
 
-        `lora`: a peft adapter for `vlm.adapter`; `full`: a whole checkpoint for `vlm.checkpoint`
-        (then with `vlm.adapter` null), weights in the dtype of the base's files; `none`: nothing.
-        Raises `DiskFull`.
+        `lora`: a peft adapter for `vlm.adapter`; `full`: a complete checkpoint for `vlm.checkpoint`
+        (then with `vlm.adapter` null), with weights in the dtype of the base's files; `none`:
+        nothing. Raises `DiskFull`.
         """
         if self.tuning.method == "none":
             return
@@ -159,7 +159,7 @@ class LiveVLM(nn.Module):
             save_checkpoint(folder, self.vlm, self.model.state_dict())
 
     def _precision(self) -> AbstractContextManager[Any]:
-        """Weights of the compute dtype need no autocast, float32 ones that learn do."""
+        """Autocast for a full tuning in half precision, whose learning weights are float32."""
         device = self._extractor.model.device.type
         half = self.tuning.method == "full" and self.vlm.dtype != "float32"
         return torch.autocast(device, getattr(torch, self.vlm.dtype) if half else None, half)

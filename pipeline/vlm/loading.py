@@ -1,4 +1,4 @@
-"""A checkpoint folder and an optional adapter -> the inner model, every weight accounted for."""
+"""A checkpoint folder and an optional adapter -> the inner model; checks every weight."""
 
 import warnings
 from math import prod
@@ -26,17 +26,17 @@ from pipeline.vlm.checkpoint_folder import (
 from pipeline.vlm.vision import tower_attention
 
 _UNUSED = {"lm_head.weight"}
-"""Weights that a feature never meets: a checkpoint may lack them."""
+"""Weights that features do not use, so a checkpoint may lack them."""
 _ADAPTER_FILES = "adapter_model.safetensors and adapter_config.json"
 
 
 def load_model(vlm: VLMParams, layers: int, device: torch.device) -> Any:
     """The inner `Qwen2_5_VLModel` with its first `layers` decoder layers, frozen, on `device`.
 
-    Raises `VLMError` where a weight is missing or left over, a file is damaged, or the adapter
-    does not fit: a model with a random weight is never returned.
+    Raises `VLMError` where a weight is missing or unexpected, a file is damaged, or the adapter
+    does not fit. A model with a random weight is never returned.
     """
-    # The language-model head goes with the wrapper: it would cost as much as a small model.
+    # The wrapper is dropped with its language-model head, which is as large as a small model.
     model = cut(load_whole(vlm, device), layers).model
     return model.eval().requires_grad_(False).to(device)
 
@@ -44,8 +44,8 @@ def load_model(vlm: VLMParams, layers: int, device: torch.device) -> Any:
 def load_whole(vlm: VLMParams, device: torch.device, dtype: str | None = None) -> Any:
     """The whole `Qwen2_5_VLForConditionalGeneration`, its adapter merged, on the CPU.
 
-    `dtype` replaces that of `vlm`: "auto" is what the files hold. `device` is where the model is
-    meant to run. Raises as `load_model`.
+    `dtype` replaces that of `vlm`; "auto" is the dtype of the files. `device` is where the model
+    will run. Raises like `load_model`.
     """
     whole = load_checkpoint(vlm, device, dtype)
     if vlm.adapter is None:
@@ -56,16 +56,16 @@ def load_whole(vlm: VLMParams, device: torch.device, dtype: str | None = None) -
 
 
 def cut(whole: Any, layers: int) -> Any:
-    """The same model with its first `layers` decoder layers only."""
+    """The same model with only its first `layers` decoder layers."""
     text = whole.model.language_model
     text.layers = text.layers[:layers]
     return whole
 
 
 def environment(model: Any) -> dict[str, str]:
-    """What may move a feature within its dtype's noise: backends, versions, device.
+    """Backends, versions and device, which may change a feature within its dtype's noise.
 
-    Pillow is what stretches and augments frames.
+    Pillow is listed because it stretches and augments frames.
     """
     device, cuda = model.device, model.device.type == "cuda"
     return {
@@ -79,7 +79,7 @@ def environment(model: Any) -> dict[str, str]:
 
 
 def attention_backend(vlm: VLMParams, device: torch.device) -> str:
-    """What `vlm.attention` means on this device."""
+    """The attention backend of `vlm` on this device."""
     if vlm.attention != "auto":
         return vlm.attention
     half = vlm.dtype != "float32"
@@ -88,7 +88,7 @@ def attention_backend(vlm: VLMParams, device: torch.device) -> str:
 
 
 def load_checkpoint(vlm: VLMParams, device: torch.device, dtype: str | None = None) -> Any:
-    """As `load_whole`, without the adapter."""
+    """Like `load_whole`, without the adapter."""
     folder = resolve_checkpoint(vlm.checkpoint, vlm.revision)
     files = weight_files(folder)
     attention = attention_backend(vlm, device)
@@ -106,7 +106,7 @@ def load_checkpoint(vlm: VLMParams, device: torch.device, dtype: str | None = No
             attn_implementation=attention,
             local_files_only=True,
             trust_remote_code=False,
-            ignore_mismatched_sizes=True,  # they are refused below, by name
+            ignore_mismatched_sizes=True,  # refused below, by name
             output_loading_info=True,
         )
     model, report = loaded
@@ -125,8 +125,8 @@ def load_checkpoint(vlm: VLMParams, device: torch.device, dtype: str | None = No
 def adapted(whole: Any, vlm: VLMParams, dropout: float | None = None) -> Any:
     """The model with `vlm.adapter` on it, not merged: a `PeftModel`.
 
-    With a `dropout` the adapter learns on, under that dropout. Raises `VLMError` where it does not
-    fit the checkpoint, or cannot be merged.
+    With a `dropout` the adapter continues to learn, with that dropout. Raises `VLMError` where the
+    adapter does not fit the checkpoint.
     """
     from peft import PeftConfig, PeftModel
 
@@ -135,7 +135,7 @@ def adapted(whole: Any, vlm: VLMParams, dropout: float | None = None) -> Any:
     adapter_files(folder)
     what = f"{_ADAPTER_FILES} hold what does not fit the checkpoint {vlm.checkpoint}"
     with warnings.catch_warnings(), ADAPTERS.foreign(folder, what):
-        # peft only warns of missing weights; the report of a second load is checked instead.
+        # peft only warns about missing weights, so the report of a second load is checked.
         warnings.simplefilter("ignore")
         config: Any = PeftConfig.from_pretrained(str(folder))
         if dropout is not None:

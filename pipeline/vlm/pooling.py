@@ -1,7 +1,7 @@
 """Token vectors -> slots.
 
-Every pooling is a weighted sum over a row's real tokens, so a batch of rows of mixed length and
-mixed views is one matrix product, and a slot without tokens is zero.
+Every pooling is a weighted sum over a row's real tokens, so one matrix product pools a batch of
+rows of mixed lengths and views, and a slot without tokens is zero.
 """
 
 from collections.abc import Sequence
@@ -20,7 +20,7 @@ from pipeline.vlm.slots import Slot
 
 @lru_cache(maxsize=64)
 def token_weights(slots: tuple[Slot, ...], layout: TokenLayout) -> NDArray[np.float32]:
-    """Weight (slot, token) of each token in each slot; a row sums to 1, or to 0 without tokens."""
+    """Weight (slot, token) of each token in each slot; each slot sums to 1, or 0 without tokens."""
     weights = np.zeros((len(slots), layout.length), np.float32)
     for row, slot in zip(weights, slots, strict=True):
         tokens = _tokens_of(slot, layout)
@@ -59,7 +59,7 @@ def _view_tokens(slot: Slot, layout: TokenLayout) -> NDArray[np.int64]:
 
 
 def _extent(cell: int, size: int, cells: int) -> slice:
-    """Tokens of one of the cells along one axis, as torch's adaptive average pooling cuts them."""
+    """The tokens of a cell along one axis, as in torch's adaptive average pooling."""
     return slice(floor(cell * size / cells), ceil((cell + 1) * size / cells))
 
 
@@ -78,7 +78,7 @@ def pool(
     weights: Float[Tensor, "batch slot token"],
     real: Bool[Tensor, "batch token"] | None,
 ) -> Float[Tensor, "batch slot dim"]:
-    """The slots, in float32 over real tokens; `real` is None where nothing is padded."""
+    """The slots, pooled in float32 over real tokens; `real` is None without padding."""
     tokens = hidden.to(torch.float32)
     if real is not None:
         # A weight of 0 is not enough: 0 x inf in the padding would be NaN.

@@ -1,4 +1,4 @@
-"""An instruction and frames -> a row ready for the model, on the CPU and without its weights."""
+"""An instruction and frames -> a row ready for the model, on the CPU, without its weights."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -17,22 +17,22 @@ from pipeline.vlm.feature_spec import FeatureSpec
 from pipeline.vlm.processor import PROMPTS, PixelSettings, PromptRenderer, TokenKind, stretch
 
 FramesByView = Mapping[str, NDArray[np.uint8] | Image.Image]
-"""RGB frames (height, width, 3) of one moment by view."""
+"""View -> RGB frame (height, width, 3), all of one moment."""
 
 
 @dataclass(frozen=True)
 class TokenLayout:
-    """Where what stands in a row's tokens; rows of equal layout need no padding between them."""
+    """Where the images are among a row's tokens; rows of equal layout need no padding."""
 
     length: int
-    """Tokens in all."""
+    """Number of tokens."""
     image_starts: tuple[tuple[str, int], ...]
-    """Each view that is present, in order, and its first image token."""
+    """Each present view, in order, and the index of its first image token."""
     grid: tuple[int, int]
     """Rows and columns of image tokens of each view, row-major in the sequence."""
 
     def image_tokens(self) -> NDArray[np.int64]:
-        """Indices (image x token) of the image tokens, view after view."""
+        """Indices (image x token,) of the image tokens, view after view."""
         size = self.grid[0] * self.grid[1]
         starts = np.array([start for _, start in self.image_starts], np.int64)
         return (starts[:, None] + np.arange(size)).reshape(-1)
@@ -40,19 +40,19 @@ class TokenLayout:
 
 @dataclass(frozen=True, eq=False)
 class PreparedRow:
-    """One row ready to be encoded: small enough to wait in a queue."""
+    """One row ready for the encoder; small enough to wait in a queue."""
 
     prompt: str
-    """The rendered prompt, one placeholder an image."""
+    """The rendered prompt, with one placeholder per image."""
     token_ids: NDArray[np.int64]
-    """(token,), the placeholders expanded to one a merged patch."""
+    """(token,), each placeholder expanded to one token per merged patch."""
     pixels: NDArray[np.uint8]
     """(image, height, width, 3) RGB at the spec's image size, views in order."""
     layout: TokenLayout
 
 
 class Preparer:
-    """Makes `PreparedRow`s; may be used from several threads (the resize releases the GIL)."""
+    """Makes `PreparedRow`s; several threads may use it (the resize releases the GIL)."""
 
     def __init__(self, vlm: VLMParams, spec: FeatureSpec) -> None:
         """Read the checkpoint's tokenizer and processor settings."""
@@ -61,17 +61,17 @@ class Preparer:
         self._augmentation = vlm.augmentation
         self._renderer = PromptRenderer(folder, vlm.prompt)
         self._settings = PixelSettings.of(vlm)
-        # An episode repeats its instruction in every row.
+        # Cached, because an episode repeats its instruction in every row.
         self._rendered = lru_cache(maxsize=4096)(self._renderer.render)
         self._tokens = lru_cache(maxsize=4096)(self._expanded_tokens)
 
     def render(self, instruction: str, views_present: Sequence[str]) -> str:
         """The prompt of a row that has these views.
 
-        Raises `VLMError` where the instruction holds a control token, or a view is not the spec's.
+        Raises `VLMError` where the instruction contains a control token, or the spec lacks a view.
         """
         prompt = self._rendered(instruction, len(self._ordered(views_present)))
-        self._tokens(prompt)  # refuses what is too long
+        self._tokens(prompt)  # refuses a prompt that is too long
         return prompt
 
     def describe(self, token: int) -> tuple[str, TokenKind]:
@@ -81,7 +81,7 @@ class Preparer:
     def prepare(self, instruction: str, frames: Mapping[str, NDArray[np.uint8]]) -> PreparedRow:
         """The row of an instruction and its frames (height, width, 3) RGB by view.
 
-        A view of the spec that is not in `frames` is missing and left out of the prompt.
+        A view of the spec that is not in `frames` is left out of the prompt.
         """
         views = self._ordered(frames)
         prompt = self.render(instruction, views)
@@ -98,10 +98,10 @@ class Preparer:
     def prepare_distinct(
         self, images: Sequence[FramesByView | None], instructions: Sequence[str]
     ) -> tuple[list[PreparedRow], list[int]]:
-        """The rows of samples that differ, each once, and which of them each sample is.
+        """The distinct rows of these samples, and the index of each sample's row.
 
-        -1 is a sample whose frames are None. Raises `VLMError` for a view that is not the spec's
-        and for what is not an RGB frame.
+        The index is -1 for a sample whose frames are None. Raises `VLMError` for a view that the
+        spec lacks and for a frame that is not RGB.
         """
         rows: list[PreparedRow] = []
         place: dict[bytes, int] = {}
@@ -121,9 +121,10 @@ class Preparer:
     def prepare_variants(
         self, instruction: str, frames: Mapping[str, NDArray[np.uint8]], key: bytes
     ) -> tuple[PreparedRow, ...]:
-        """The row once a variant of the spec: 0 as `prepare` makes it, then augmented.
+        """The row in each variant of the spec: 0 is plain, as from `prepare`, the others augmented.
 
-        `key` is the row's key: what is drawn depends on nothing else. All have one layout.
+        The augmentation depends only on its params, the row's `key`, view and variant. All variants
+        have the same layout.
         """
         plain = self.prepare(instruction, frames)
         rows, (height, width) = [plain], self._settings.image_size
@@ -132,7 +133,7 @@ class Preparer:
             for place, image, (view, _) in zip(
                 pixels, plain.pixels, plain.layout.image_starts, strict=True
             ):
-                # Changed at the model's size, where images are smallest.
+                # Augmented at the model's size, where images are smallest.
                 widened = (width / frames[view].shape[1]) / (height / frames[view].shape[0])
                 drawn = Augmentation.drawn(self._augmentation, key, view, variant)
                 place[:] = drawn.apply(image, widened)
@@ -149,7 +150,7 @@ class Preparer:
         return tuple(view for view in self._spec.views if view in views)
 
     def _expanded_tokens(self, prompt: str) -> tuple[NDArray[np.int64], tuple[int, ...]]:
-        """Token ids with each image's placeholder repeated, and where each image begins."""
+        """Token ids with each image's placeholder repeated, and each image's first index."""
         ids = np.array(self._renderer.tokenize(prompt), np.int64)
         is_image = ids == self._renderer.image_token_id
         rows, columns = self._settings.merged_grid

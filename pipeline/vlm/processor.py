@@ -1,7 +1,7 @@
-"""What a checkpoint's processor makes of an instruction and of frames: text, tokens and pixels.
+"""A checkpoint's processor: it turns an instruction and frames into text, tokens and pixels.
 
-The CPU only stretches frames (Pillow), and needs no torch; `extractor` cuts them into patches where
-the model is.
+The CPU only stretches frames (Pillow), without torch; `extractor` cuts them into patches on the
+model's device.
 """
 
 import json
@@ -35,19 +35,19 @@ _PART_OF_A_CHARACTER = "\ufffd"
 _TOKENIZERS = r"^(Qwen2Tokenizer(Fast)?|PreTrainedTokenizerFast|TokenizersBackend)$"
 
 TokenKind = Literal["text", "special", "image"]
-"""What the model reads a token as: words, control, or a part of a picture."""
+"""What a token is for the model: words, control, or a part of an image."""
 
 
 class _TokenizerConfig(Document):
     tokenizer_class: Annotated[str, Field(pattern=_TOKENIZERS)] | None = None
     fast_tokenizer_files: None = None
-    """Files that would be read in place of tokenizer.json, by any path."""
+    """Files, at any path, that would be read instead of tokenizer.json."""
 
 
 class PromptRenderer:
     """Renders one user turn of a checkpoint's chat template and splits it into tokens.
 
-    Holds the tokenizer, no weights. May be used from several threads.
+    It holds the tokenizer and no weights. Several threads may use it.
     """
 
     def __init__(self, folder: Path, template: str) -> None:
@@ -55,7 +55,7 @@ class PromptRenderer:
 
         Raises `VLMError` where they are missing or do not fit the model's config.
         """
-        from transformers import AutoTokenizer  # takes long: types and tokens alone do without
+        from transformers import AutoTokenizer  # slow to import; types and tokens need none
 
         config = read_config(folder)
         tokenizer_files(folder)
@@ -80,7 +80,7 @@ class PromptRenderer:
     def render(self, instruction: str, images: int) -> str:
         """The text of one user turn with a placeholder token for each image.
 
-        Raises `VLMError` where the instruction holds a token that the model reads as control.
+        Raises `VLMError` where the instruction contains a control token.
         """
         self._refuse_specials(instruction, "the instruction")
         text = self._rendered(instruction, images)
@@ -91,13 +91,13 @@ class PromptRenderer:
         return text
 
     def tokenize(self, text: str) -> list[int]:
-        """The token ids of a rendered prompt, one for each image still."""
-        # The Rust tokenizer itself: the Python wrapper around it is not safe among threads.
+        """The token ids of a rendered prompt, still with one per image."""
+        # The Rust tokenizer itself, because its Python wrapper is not thread-safe.
         with PROMPTS.foreign(shown(text), "cannot be cut into tokens"):
             return self._tokenizer.backend_tokenizer.encode(text, add_special_tokens=False).ids
 
     def describe(self, token: int) -> tuple[str, TokenKind]:
-        """The text of a token and its kind; a part of a character as the vocabulary spells it."""
+        """The text of a token (for a part of a character, its vocabulary entry) and its kind."""
         text: str = self._tokenizer.decode([token], clean_up_tokenization_spaces=False)
         if _PART_OF_A_CHARACTER in text:
             text = self._tokenizer.convert_ids_to_tokens(token)
@@ -142,7 +142,7 @@ class PromptRenderer:
             )
 
         model = json.loads(self._tokenizer.backend_tokenizer.to_str())["model"]
-        # A merge makes each token of several characters, but for the control tokens.
+        # Each token of several characters comes from a merge, except the control tokens.
         made = sum(len(token) > 1 and token[0] + token[-1] != "<>" for token in model["vocab"])
         if len(model["merges"]) < made:
             found = len(model["merges"])
@@ -163,12 +163,12 @@ class PromptRenderer:
 
 @dataclass(frozen=True)
 class PixelSettings:
-    """What a checkpoint's image processor does, and the one size that frames are stretched to."""
+    """The settings of a checkpoint's image processor, and the size of stretched frames."""
 
     resize: tuple[int, int]
-    """Height and width asked for."""
+    """Requested height and width."""
     image_size: tuple[int, int]
-    """Height and width that the processor makes of it: multiples of patch size x merge size."""
+    """The processor's height and width for it: multiples of patch size x merge size."""
     patch_size: int
     merge_size: int
     temporal_patch_size: int
@@ -193,13 +193,13 @@ class PixelSettings:
 
     @classmethod
     def of(cls, vlm: VLMParams) -> "PixelSettings":
-        """Those of the checkpoint of `vlm` for frames of the size that it asks for."""
+        """The settings of the checkpoint and the image size of `vlm`."""
         folder = resolve_checkpoint(vlm.checkpoint, vlm.revision)
         return cls.read(folder, (vlm.image_resize_height, vlm.image_resize_width))
 
     @classmethod
     def read(cls, folder: Path, resize: tuple[int, int]) -> "PixelSettings":
-        """The settings of a checkpoint folder for frames asked for at `resize` (height, width)."""
+        """The settings of a checkpoint folder for the requested size `resize` (height, width)."""
         from transformers.models.qwen2_vl.image_processing_pil_qwen2_vl import smart_resize
 
         settings = _read_image_processor(folder)
@@ -230,7 +230,7 @@ class _Size(Document):
 
 
 class _ImageProcessor(Document):
-    """The settings of transformers' image processor, which takes any value for them."""
+    """The settings of transformers' image processor, which itself accepts any value."""
 
     model_config = ConfigDict(from_attributes=True)
 
@@ -248,10 +248,10 @@ class _ProcessorConfig(Document):
 
 
 def _read_image_processor(folder: Path) -> _ImageProcessor:
-    """What transformers' image processor of a checkpoint does.
+    """The settings of a checkpoint's image processor.
 
-    Raises `VLMError` where it does something else than `extractor.patchify`, or its patches are not
-    those of the model.
+    Raises `VLMError` where it does something else than `extractor.patchify`, or its patch sizes are
+    not those of the model.
     """
     from transformers.models.qwen2_vl.image_processing_pil_qwen2_vl import Qwen2VLImageProcessorPil
 

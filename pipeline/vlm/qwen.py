@@ -24,7 +24,7 @@ class FrozenVLM:
     """A loaded Qwen2.5-VL that turns prepared rows into pooled features, and never learns."""
 
     environment: dict[str, str]
-    """Attention backend, library versions and device: recorded, not part of the identity."""
+    """Attention backend, library versions and device; recorded, but not part of the identity."""
 
     def __init__(
         self, model: Any, settings: PixelSettings, spec: FeatureSpec, compiled: bool = False
@@ -44,9 +44,9 @@ class FrozenVLM:
     ) -> "FrozenVLM":
         """The checkpoint (and adapter) of `vlm` in its dtype, cut after the last layer needed.
 
-        `device` is a torch device or "auto": CUDA where there is one. With `compile`, the first
-        batch of a shape takes minutes and the others less time. Raises `VLMError` where the
-        folder is incomplete, a weight is missing or left over, or the adapter does not fit.
+        `device` is a torch device or "auto" (CUDA if there is one). With `compile`, the first batch
+        of a shape takes minutes and later ones are faster. Raises `VLMError` where the folder is
+        incomplete, a weight is missing or unexpected, or the adapter does not fit.
         """
         model = load_model(vlm, layers_needed(spec.slots), resolve_device(device))
         return cls(model, PixelSettings.of(vlm), spec, compile)
@@ -61,9 +61,9 @@ class FrozenVLM:
     ) -> tuple[Float[Tensor, "batch slot dim"], Bool[Tensor, "batch slot"]]:
         """Features of each row in the storage dtype, and which slots are valid, both on the CPU.
 
-        A slot whose view is missing is zero and invalid. A row is the same, within the compute
-        dtype's noise, whatever rows stand beside it; rows of equal `layout` are fastest.
-        Raises `NumericsError` naming row and slot where a feature is NaN or infinite.
+        A slot whose view is missing is zero and invalid. A row's features do not depend on the
+        other rows, except for the compute dtype's noise; rows of equal `layout` are fastest. Raises
+        `NumericsError`, which names row and slot, where a feature is NaN or infinite.
         """
         return self.submit(rows).result()
 
@@ -71,18 +71,18 @@ class FrozenVLM:
     def submit(self, rows: Sequence[PreparedRow]) -> "Pending":
         """Begin to encode rows: on a GPU this returns while it works, elsewhere when it is done.
 
-        What went wrong with the features is raised by the `result`, out of memory here, and
-        `VLMError` where the model cannot be compiled.
+        Raises out-of-memory errors, and `VLMError` where the model cannot be compiled. Errors in
+        the features are raised by `result`.
         """
         layout, padded = rows[0].layout, self._padded(rows)
-        # Pinned memory and events belong to the thread's current device, which need not be ours.
+        # Pinned memory and events belong to the thread's current device, which may be another.
         with torch.cuda.device(self.device if self.device.type == "cuda" else -1):
             try:
                 batch = self._extractor.collate(padded)
                 valid = self._extractor.valid(batch)[: len(rows)]
 
                 def compute() -> Float[Tensor, "batch slot dim"]:
-                    # Cut and converted before they leave the device: a padded row is nobody's.
+                    # Padded rows are dropped, and features converted, before they leave the device.
                     return self._extractor.features(batch)[: len(rows)].to(self._storage_dtype)
 
                 pending = Pending(compute, valid, self.device, self._check_finite)
@@ -95,9 +95,9 @@ class FrozenVLM:
         return pending
 
     def _padded(self, rows: Sequence[PreparedRow]) -> Sequence[PreparedRow]:
-        """What a compiled model is given: as many rows as it has been given before, or more.
+        """For a compiled model, the rows padded to a batch size that it has had before.
 
-        So that the last batch of a shape is not compiled anew.
+        So the last batch of a shape is not compiled again.
         """
         layout = rows[0].layout
         if not self._compiled or any(row.layout != layout for row in rows):
@@ -106,7 +106,7 @@ class FrozenVLM:
         return [*rows, *[rows[-1]] * (full - len(rows))]
 
     def _check_finite(self, features: Float[Tensor, "batch slot dim"]) -> None:
-        least, most = torch.aminmax(features)  # in one pass; of a NaN, both are NaN
+        least, most = torch.aminmax(features)  # one pass; both are NaN if any value is
         if not math.isfinite(least) or not math.isfinite(most):
             bad = ~torch.isfinite(features).all(dim=-1)
             row, slot = (int(index) for index in bad.nonzero()[0])
@@ -120,9 +120,10 @@ class FrozenVLM:
 
 
 class Pending:
-    """Features that are being computed, or on their way to the CPU.
+    """Features that are being computed or copied to the CPU.
 
-    What the model takes is told by the device's own clock where it has one: the host does not wait.
+    The device's own clock, if it has one, measures the model's time, so that the host does not
+    wait.
     """
 
     def __init__(
@@ -144,7 +145,7 @@ class Pending:
         self._copied = _event(device)
 
     def result(self) -> tuple[Float[Tensor, "batch slot dim"], Bool[Tensor, "batch slot"]]:
-        """What `FrozenVLM.encode` gives, when it is there; raises as it does."""
+        """Wait for the result of `FrozenVLM.encode`; raises like it."""
         if self._copied:
             self._copied.synchronize()
         self._check(self._features)
@@ -152,7 +153,7 @@ class Pending:
 
     @property
     def done(self) -> bool:
-        """Whether the `result` is there, without waiting for it."""
+        """Whether the `result` is ready; does not wait."""
         return self._copied is None or self._copied.query()
 
     @property
@@ -166,7 +167,7 @@ class Pending:
 
 
 def _event(device: torch.device) -> torch.cuda.Event | None:
-    """This moment in the device's work; nothing on the CPU, whose work is done by then."""
+    """An event at this point of the device's work; None on the CPU, which does not run ahead."""
     if device.type != "cuda":
         return None
     event = torch.cuda.Event(enable_timing=True)
@@ -175,7 +176,7 @@ def _event(device: torch.device) -> torch.cuda.Event | None:
 
 
 def _of_compiler(error: RuntimeError) -> RuntimeError | VLMError:
-    """What torch.compile's error means to a user; the error itself where that did not raise it."""
+    """torch.compile's error as an error for users; another error unchanged."""
     from torch._dynamo.exc import BackendCompilerFailed, TorchDynamoException  # takes a second
 
     if not isinstance(error, TorchDynamoException):

@@ -11,22 +11,22 @@ from pipeline.base.errors import VLMError
 
 @dataclass(frozen=True)
 class Slot:
-    """One pooled vector of a row: which layer, normed or not, over which tokens."""
+    """One pooled vector of a row: its layer, whether it is normed, and its tokens."""
 
     layer: int
-    """Counted from the first, so never negative."""
+    """Index from the first layer; never negative."""
     norm: bool
     pooling: str
     view: str | None = None
     cell: tuple[int, int] | None = None
     """Row and column in the `grid` of a view."""
     grid: tuple[int, int] = (4, 4)
-    """Rows and columns that the view of a cell is cut into."""
+    """Rows and columns into which the cell's view is cut."""
 
     def document(self) -> dict[str, Any]:
-        """The slot as JSON-able values, without what does not apply.
+        """The slot as JSON-able values, without entries that do not apply.
 
-        All cells together tell the grid, so it is not named.
+        The grid is left out, because all cells together show it.
         """
         document = {name: value for name, value in vars(self).items() if value is not None}
         del document["grid"]
@@ -34,9 +34,10 @@ class Slot:
 
 
 def slots_of(vlm: VLMParams, layers: int, views: Sequence[str]) -> tuple[Slot, ...]:
-    """The slots that `vlm` asks of a model of this many decoder layers for these views, in order.
+    """The slots of `vlm` for a model with this many decoder layers and these views, in order.
 
-    Raises `VLMError` for a layer past the model, for what is asked twice, and where none is left.
+    Raises `VLMError` for a layer that the model lacks, for a repeated entry, and where no slot is
+    left.
     """
     for name, values in (("norms", vlm.norms), ("pooling", vlm.pooling)):
         if len(set(values)) < len(values):
@@ -67,14 +68,14 @@ def _slots_of(
 
 
 def slot_documents(slots: Sequence[Slot], variants: int) -> list[dict[str, Any]]:
-    """The slots of a whole row as JSON-able values: variant after variant, where there are any."""
+    """All slots of a row as JSON-able values, one variant after the other if there are several."""
     if variants == 1:
         return [slot.document() for slot in slots]
     return [slot.document() | {"variant": v} for v in range(variants) for slot in slots]
 
 
 def slot_name(document: Mapping[str, Any]) -> str:
-    """A slot of any variant, as a spec describes it, in a few words."""
+    """A short name for a slot document of a spec, without its variant."""
     cell = ",".join(map(str, document.get("cell") or ()))
     layer = f"layer {document['layer']}{'' if document['norm'] else ' no norm'}"
     return " ".join(filter(None, (layer, document["pooling"], document.get("view"), cell)))

@@ -1,4 +1,4 @@
-"""What of the model learns, and what is written of what it has learned."""
+"""Which weights of the model learn, and how the learned weights are saved."""
 
 import re
 import shutil
@@ -19,11 +19,11 @@ from pipeline.vlm.loading import adapted, cut, load_checkpoint, load_whole
 from pipeline.vlm.slots import Slot
 
 TOWERS = {"language": "model.language_model.", "vision": "model.visual."}
-"""Where each tower stands in a `Qwen2_5_VLForConditionalGeneration`."""
+"""Prefix of each tower's names in a `Qwen2_5_VLForConditionalGeneration`."""
 
 
 _COMPANIONS = ("*config.json", "chat_template.*", "*token*.json", "vocab.json", "merges.txt")
-"""What a checkpoint folder holds beside its weights."""
+"""The files of a checkpoint folder besides its weights."""
 
 
 def load_adapting(
@@ -31,12 +31,12 @@ def load_adapting(
 ) -> tuple[Any, dict[str, Tensor]]:
     """A `PeftModel` of the first `layers` layers whose low-rank adapters learn, on the CPU.
 
-    They stand on every linear layer of the chosen towers; with `vlm.adapter` they are those of
-    that adapter, gone on from. Also the adapter's weights on layers beyond, which it keeps.
-    Raises `VLMError` where the adapter is of another rank, scale or towers than `tuning` says.
+    There is one on every linear layer of the chosen towers; with `vlm.adapter`, training continues
+    from that adapter. Also returns that adapter's weights on later layers, which a saved adapter
+    keeps. Raises `VLMError` where the adapter has another rank, scale or towers than `tuning`.
     """
     whole = load_checkpoint(vlm, device)
-    # A feature never meets the head.
+    # Features do not use the head.
     whole.lm_head = nn.Identity()
     if vlm.adapter is None:
         model, beyond = _fresh_adapter(whole, vlm, tuning, layers), {}
@@ -57,30 +57,30 @@ def load_adapting(
 def load_learning(
     vlm: VLMParams, tuning: TuningParams, slots: tuple[Slot, ...], layers: int, device: torch.device
 ) -> Any:
-    """The inner model of the first `layers` layers with every weight of the towers learning.
+    """The inner model of the first `layers` layers, in which every weight of the towers learns.
 
-    Those weights are float32 whatever `vlm.dtype`, which small steps would be lost in.
+    Those weights are always float32, because `vlm.dtype` may be too coarse for small steps.
     """
     whole = cut(load_whole(vlm, device), layers)
     whole.requires_grad_(False)
     for tower in tuning.towers:
         whole.get_submodule(TOWERS[tower].rstrip(".")).float().requires_grad_(True)
     if not any(slot.norm for slot in slots):
-        # Nothing reads what the final norm gives.
+        # Nothing reads the output of the final norm.
         whole.model.language_model.norm.requires_grad_(False)
     return whole.model
 
 
 def save_adapter(folder: Path, model: Any, beyond: Mapping[str, Tensor]) -> None:
-    """Write the adapter of a `PeftModel` in peft's format, and what it keeps beyond the model.
+    """Write the adapter of a `PeftModel` in peft's format, with its weights on later layers.
 
     Raises `DiskFull`.
     """
     weights = folder / "adapter_model.safetensors"
     with disk_full_named(folder):
-        # Whether embeddings were resized would be asked of the hub: they never are.
+        # Otherwise peft asks the hub whether embeddings were resized, which never happens here.
         model.save_pretrained(str(folder), save_embedding_layers=False)
-        # A template of a model card with nothing filled in.
+        # An empty template of a model card.
         (folder / "README.md").unlink(missing_ok=True)
         if beyond:
             write_tensors(weights, load_file(weights) | dict(beyond))
@@ -88,10 +88,10 @@ def save_adapter(folder: Path, model: Any, beyond: Mapping[str, Tensor]) -> None
 
 
 def save_checkpoint(folder: Path, vlm: VLMParams, tuned: Mapping[str, Tensor]) -> None:
-    """Write the checkpoint of `vlm` with these weights of its inner model in place of its own.
+    """Write the checkpoint of `vlm` with these weights in its inner model.
 
-    Every other weight, in the files' own dtype, and every other file is the base's (with
-    `vlm.adapter` merged). Raises `DiskFull`.
+    All other weights (with `vlm.adapter` merged) and files are those of the base; weights keep the
+    dtype of its files. Raises `DiskFull`.
     """
     plain = vlm.model_copy(update={"attention": "sdpa"})
     whole = load_whole(plain, torch.device("cpu"), dtype="auto")
@@ -115,7 +115,7 @@ def _fresh_adapter(whole: Any, vlm: VLMParams, tuning: TuningParams, layers: int
         target_modules=_targets(whole, tuning, layers),
     )
     with warnings.catch_warnings():
-        # peft 0.21 reads an attribute that transformers 5.23 calls deprecated.
+        # peft 0.21 reads an attribute that is deprecated in transformers 5.23.
         warnings.filterwarnings("ignore", "`is_gradient_checkpointing`", FutureWarning)
         return get_peft_model(whole, config)
 
@@ -123,7 +123,7 @@ def _fresh_adapter(whole: Any, vlm: VLMParams, tuning: TuningParams, layers: int
 def _targets(whole: Any, tuning: TuningParams, layers: int) -> str:
     """A regular expression that matches the linear layers that run, and no other module.
 
-    It goes into the adapter's config, where a set of names would stand in random order.
+    It is written into the adapter's config, where a set of names would be in random order.
     """
     kept = "|".join(map(str, range(layers)))
     towers = tuple(TOWERS[tower] for tower in tuning.towers)
@@ -157,7 +157,7 @@ def _check_goes_on(model: Any, vlm: VLMParams, tuning: TuningParams) -> None:
 
 
 def _beyond(model: Any, layers: int) -> dict[str, Tensor]:
-    """The adapter's weights on decoder layers that do not run, by their names in its file."""
+    """The adapter's weights on decoder layers that do not run, by name in its file."""
     place = re.compile(r"\.language_model\.layers\.(\d+)\..*\.lora_")
     weights = ((name, place.search(name), tensor) for name, tensor in model.state_dict().items())
     return {
@@ -168,7 +168,7 @@ def _beyond(model: Any, layers: int) -> dict[str, Tensor]:
 
 
 def _finish(folder: Path) -> None:
-    """Give the files what the umask leaves (safetensors writes for the owner alone); sync them."""
+    """Give the files the folder's mode (safetensors writes only for the owner) and sync them."""
     for file in folder.iterdir():
         file.chmod(folder.stat().st_mode & 0o666)
         sync(file)

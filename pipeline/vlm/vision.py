@@ -1,9 +1,9 @@
 """The vision tower's forward pass, with every length known beforehand.
 
-transformers' own, without flash-attention, attends to one window after the other and asks the
-device for each one's length. All images of a batch have one grid here, so what depends on it is
-worked out once on the host and nothing is read back; patches are put in an order in which windows
-of equal length are neighbours, and each length is one batched call.
+Without flash-attention, transformers' own pass attends to one window after the other and asks the
+device for the length of each. Here all images of a batch have one grid, so everything that depends
+on it is computed once on the host and nothing is read back. Patches are ordered so that windows of
+equal length are neighbours, and each length is one batched call.
 """
 
 from collections import Counter
@@ -24,28 +24,28 @@ from transformers.models.qwen2_5_vl.modeling_qwen2_5_vl import eager_attention_f
 from transformers.vision_utils import get_vision_position_ids, get_vision_window_index
 
 _KEPT = 64
-"""Plans that are remembered: equal images are seen once, so batches show more or fewer."""
+"""Most plans that are kept; batches differ in their number of distinct images."""
 
 
 @dataclass(frozen=True)
 class PatchWindows:
-    """How patches stand: by window length, then image, then window."""
+    """The order of patches: by window length, then image, then window."""
 
     images: int
     lengths: tuple[tuple[int, int], ...]
-    """Windows of an image, and patches of a window, for each length that there is."""
+    """For each window length: windows per image, and patches per window."""
     whole: bool = False
-    """Whether a block attends over whole images."""
+    """Whether a block attends over complete images."""
 
 
 @dataclass(frozen=True)
 class TowerPlan:
-    """What the tower has to know of a number of images, on its device."""
+    """What the tower needs for a number of images, on its device."""
 
     order: Int64[Tensor, " token"]
-    """Which image token stands where: the tower works in an order of its own."""
+    """The image token at each position: the tower has its own order."""
     place: NDArray[np.int64]
-    """(token,) where each image token stands; on the host."""
+    """(token,) the position of each image token; on the host."""
     windowed: dict[str, Any]
     """Arguments of the blocks that attend within windows."""
     whole: dict[str, Any]
@@ -55,12 +55,12 @@ class TowerPlan:
 class VisionTower:
     """Runs the parts of a `Qwen2_5_VisionTransformerPretrainedModel` over images of one grid.
 
-    What it gives is the model's own, in the order of the plan; gradients flow, and blocks are
-    checkpointed as the model is set.
+    The result is that of the model, in the order of the plan. Gradients flow, and blocks are
+    checkpointed if the model is set so.
     """
 
     def __init__(self, visual: Any, grid: tuple[int, int]) -> None:
-        """`grid` is rows and columns of patches. Sets the attention that `visual` uses."""
+        """`grid` is the rows and columns of patches. Changes the attention that `visual` uses."""
         self.visual = visual
         attention = str(visual.config._attn_implementation)
         self._flash = attention.startswith("flash_attention")
@@ -78,7 +78,7 @@ class VisionTower:
         self._plans: dict[int, TowerPlan] = {}
 
     def plan(self, images: int, device: torch.device) -> TowerPlan:
-        """What a pass over this many images needs; worked out once, on the host."""
+        """The plan for a pass over this many images; computed once, on the host."""
         if images not in self._plans:
             if len(self._plans) == _KEPT:
                 del self._plans[next(iter(self._plans))]
@@ -101,9 +101,9 @@ class VisionTower:
         return visual.merger(hidden)
 
     def _embedded(self, patches: Float[Tensor, "patch value"]) -> Float[Tensor, "patch dim"]:
-        """A convolution whose kernel is its stride and its input is one product, and far faster."""
+        """The patch embedding as one matrix product: its kernel covers the input. Far faster."""
         projection = self.visual.patch_embed.proj
-        if type(projection) is not nn.Conv3d:  # an adapter stands on it
+        if type(projection) is not nn.Conv3d:  # it has an adapter
             return self.visual.patch_embed(patches)
         weight = projection.weight.flatten(1)
         return nn.functional.linear(patches.to(weight.dtype), weight)
@@ -112,7 +112,7 @@ class VisionTower:
         tokens = sum(map(len, self._windows))
         every = [(image, window) for image in range(images) for window in self._windows]
         if not self._flash:
-            every.sort(key=lambda placed: len(placed[1]))  # stable: then by image and by window
+            every.sort(key=lambda placed: len(placed[1]))  # stable: image and window order stay
         order = np.concatenate([image * tokens + window for image, window in every])
         place = np.empty_like(order)
         place[order] = np.arange(len(order))
@@ -124,7 +124,7 @@ class VisionTower:
     def _spans(
         self, images: int, lengths: list[int], device: torch.device
     ) -> tuple[dict[str, Any], ...]:
-        """What a block is told of windows that stand one behind the other, and of whole images."""
+        """Arguments for blocks that attend within consecutive windows, and within whole images."""
         patches = sum(lengths) // images
         if self._flash:
             windowed, whole = ([0, *accumulate(of)] for of in (lengths, [patches] * images))
@@ -147,12 +147,12 @@ class VisionTower:
 
 
 def tower_attention(visual: Any) -> str:
-    """What a tower attends with, as it is recorded."""
+    """The tower's attention backend, as it is recorded."""
     return str(visual.config._attn_implementation).replace("grouped_flash_", "grouped ")
 
 
 def sent(tensor: Tensor, device: torch.device) -> Tensor:
-    """The tensor of the CPU on its way to a device, which nobody waits for."""
+    """Send a CPU tensor to a device without waiting."""
     if device.type == "cuda" and not tensor.is_pinned():
         tensor = tensor.pin_memory()
     return tensor.to(device, non_blocking=True)
@@ -171,8 +171,8 @@ def _grouped_attention(
     dropout: float,
     **_: object,
 ) -> tuple[Float[Tensor, "1 patch head dim"], None]:
-    """Attention of each window, or of each image, by one call of `attend` for every length."""
-    # Patches first: windows of equal length are then one view, without a copy.
+    """Attention within each window, or each image, by one call of `attend` per length."""
+    # With patches first, windows of equal length are one view, without a copy.
     flat = [tensor[0].transpose(0, 1) for tensor in (query, key, value)]
     group = _of_images if windows.whole else _of_windows
     options = {"scaling": scaling, "dropout": dropout, "is_causal": False}
@@ -204,7 +204,7 @@ def _of_images(tensor: Float[Tensor, "patch head dim"], windows: PatchWindows) -
 
 
 _GROUPED = {"sdpa": "grouped_flash_sdpa", "eager": "grouped_flash_eager"}
-"""A name has to hold "flash" for transformers to leave windows together."""
+"""transformers keeps windows together only if the name contains "flash"."""
 
 for _kind, _attend in (("sdpa", sdpa_attention_forward), ("eager", eager_attention_forward)):
     AttentionInterface.register(_GROUPED[_kind], partial(_grouped_attention, attend=_attend))

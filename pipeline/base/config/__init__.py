@@ -1,10 +1,10 @@
 """params.yaml -> Params.
 
 Every section is a frozen model that forbids unknown keys, so that a misspelt key is an error and
-not a default; all errors are reported at once. `stage_one` has the sections of the demo, the data,
-extraction and looking, `stage_two` those of training, tuning and evaluation, `policy` those of the
-policy's parts, `stores` those of what is done with stores; `sections` has them all and describes
-their keys; `limits` has what stands in a file of its own; `load` reads files.
+not a default; all errors are reported at once. `stage_one` has the sections for the demo, the data,
+extraction and inspection, `stage_two` those for training, tuning and evaluation, `policy` those for
+the policy's parts, `stores` those for work on stores. `sections` has all of them and describes
+their keys; `limits` has the sections of a separate limits file; `load` reads files.
 """
 # ruff: noqa: F401
 # pyright: reportUnusedImport=false

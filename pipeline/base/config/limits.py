@@ -1,4 +1,4 @@
-"""The content of a file of limits, which keep a robot from harm (`pipeline.robot.limits`)."""
+"""The content of a limits file, which protects a robot from harm (`pipeline.robot.limits`)."""
 
 from typing import Annotated, Literal
 
@@ -13,34 +13,34 @@ class MotionLimit(Section):
     """The largest motion, and the reaction to a larger one."""
 
     most: Most
-    """By `translation` or `rotation`, the length of these channels together, or by the name of an
-    action's channel, its size."""
+    """Largest length of all `translation` or all `rotation` channels together, or largest absolute
+    value of the action channel with this name."""
     on_exceed: Literal["stop", "clip"] = "stop"
-    """stop: a safe stop. clip: the longest that is allowed is sent, in the same direction."""
+    """stop: a safe stop. clip: send the longest allowed motion in the same direction."""
 
 
 class Workspace(Section):
     """The space in which the robot may be."""
 
     box: dict[str, tuple[float, float]]
-    """Lowest and highest reading by the name of a state's channel."""
+    """Lowest and highest reading for each named state channel."""
 
 
 class Force(Section):
     """The largest force of the robot."""
 
     most: Most
-    """Largest size of a reading by the name of a sensor's channel."""
+    """Largest absolute reading for each named sensor channel."""
 
 
 class LimitsFile(Section):
     """The content of a limits file; a missing entry is no limit."""
 
     step: MotionLimit | None = None
-    """Of one action, in the units of the action."""
+    """Limit of one action, in the units of the action."""
     speed: MotionLimit | None = None
-    """Units per s."""
+    """Limit in units per s."""
     acceleration: MotionLimit | None = None
-    """Units per s²."""
+    """Limit in units per s²."""
     workspace: Workspace | None = None
     force: Force | None = None

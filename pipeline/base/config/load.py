@@ -1,4 +1,4 @@
-"""Read params.yaml and other YAML of sections: the only place that reads YAML."""
+"""Read params.yaml and other YAML files of sections; the only module that reads YAML."""
 
 import shlex
 from collections.abc import Sequence
@@ -39,9 +39,9 @@ _REPLACED = {
 
 
 def load_params(path: Path, overrides: Sequence[str] = ()) -> Params:
-    """The params of a YAML file with `section.key=value` overrides laid over it.
+    """The params of a YAML file after `section.key=value` overrides.
 
-    A value is YAML, so `[1, 2]`, `null` and JSON work. Raises `ConfigError` with every problem.
+    A value is YAML, so `[1, 2]`, `null` and JSON work. Raises one `ConfigError` with every problem.
     """
     document = _read(path)
     for override in overrides:
@@ -51,15 +51,15 @@ def load_params(path: Path, overrides: Sequence[str] = ()) -> Params:
 
 
 def load_section(path: Path, section: type[_Section]) -> _Section:
-    """A section that stands in a YAML file of its own.
+    """A section that is in its own YAML file.
 
-    Raises `ConfigError` with every problem, by file and key.
+    Raises one `ConfigError` with every problem, by file and key.
     """
     return _as_section(_read(path), section, str(path))
 
 
 def setting(key: str, value: Path | Sequence[str]) -> str:
-    """`--set key=value` for advice: pasted into a shell, it gives this value."""
+    """`--set key=value` for advice; quoted for a shell, so that it gives this value."""
     texts = [str(value)] if isinstance(value, Path) else list(value)
     text = yaml.safe_dump(
         texts, default_flow_style=True, allow_unicode=True, width=float("inf")
@@ -90,14 +90,14 @@ def _lay_over(document: dict[str, Any], override: str) -> None:
             above = named(".".join(keys[:depth]))
             why = f"{above} is a {type(child).__name__}, not a section; set it whole"
             raise _SET.refusal(where, why)
-        # A copy, for an alias shares it with another section.
+        # A copy, because a YAML alias may share it with another section.
         node[key] = dict(child)
         node = node[key]
     node[keys[-1]] = value
 
 
 class _Loader(yaml.SafeLoader):
-    """The safe loader; a date is a text, and a key that stands twice in a section is refused."""
+    """The safe loader; a date stays text, and a repeated key in a section is refused."""
 
     yaml_implicit_resolvers: ClassVar = {
         first: [resolver for resolver in resolvers if resolver[0] != "tag:yaml.org,2002:timestamp"]
@@ -105,7 +105,7 @@ class _Loader(yaml.SafeLoader):
     }
 
     def compose_mapping_node(self, anchor: Any) -> Any:
-        """The section; PyYAML itself would keep the last of two equal keys."""
+        """Refuse repeated keys; PyYAML itself would keep the last one."""
         node: Any = super().compose_mapping_node(anchor)
         keys = set[str]()
         for key, _ in node.value:
@@ -154,7 +154,7 @@ def _unknown_key(place: Sequence[str], root: type[BaseModel]) -> str:
 
 
 def _section_in(annotation: Any) -> Any:
-    """The section that a field or its tuple holds."""
+    """The section type of a field, or of its tuple's entries."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return annotation
     return _section_in(next(part for part in get_args(annotation) if part is not Ellipsis))

@@ -8,24 +8,24 @@ from pipeline.base.config.section import Section
 
 
 class SensorEncoderParams(Section):
-    """Widths of the sensor encoder; its size and cost are printed when a training begins."""
+    """Sizes of the sensor encoder; its parameters and cost are printed when training begins."""
 
     kind: Literal["joint", "force_aware"] = "joint"
-    """One branch for all channels, or one of its own for force, so that it is not drowned."""
+    """joint: one branch for all channels. force_aware: force has its own and is not lost."""
     channels: tuple[Annotated[int, Field(ge=1, le=8192)], ...] = Field(
         default=(64, 128, 128, 128), min_length=1, max_length=16
     )
-    """Of each residual convolution block; every block halves the length."""
+    """Width of each residual convolution block; every block halves the length."""
     layers: int = Field(default=1, ge=0, le=128)
     """Transformer layers after the convolutions."""
     heads: int = Field(default=4, ge=1, le=256)
-    """Must divide the last of `channels`."""
+    """Attention heads; must divide the last of `channels`."""
     output_dim: int = Field(default=128, ge=1, le=8192)
     """Width of the encoded window."""
 
 
 class StateEncoderParams(Section):
-    """Widths of the robot-state encoder."""
+    """Sizes of the robot-state encoder."""
 
     dim: int = Field(default=64, ge=1, le=8192)
     """Width of its transformer."""
@@ -36,47 +36,47 @@ class StateEncoderParams(Section):
     output_dim: int = Field(default=64, ge=1, le=8192)
     """Width of the encoded window."""
     patch: int = Field(default=10, ge=1, le=10_000)
-    """Readings a token."""
+    """Readings per token."""
 
 
 class ExpertParams(Section):
-    """Widths of the action expert, whichever it is."""
+    """Sizes of the action expert, of any kind."""
 
     dim: int = Field(default=128, ge=1, le=8192)
-    """Width of its transformer, and of the context it attends to."""
+    """Width of its transformer and of its context."""
     layers: int = Field(default=2, ge=1, le=128)
     """Transformer layers."""
     heads: int = Field(default=4, ge=1, le=256)
     """Must divide `dim`."""
     dropout: Annotated[float, Field(ge=0, lt=1)] = 0.1
-    """While training."""
+    """Dropout during training."""
 
 
 class RegressionParams(Section):
-    """What only the regression expert has."""
+    """Params of the regression expert only."""
 
     refinements: int = Field(default=1, ge=1, le=100)
-    """Rounds of prediction; the first proposal is zeros, each later one the round before."""
+    """Rounds of prediction; the first starts from zeros, each later one from the round before."""
 
 
 class DiffusionParams(Section):
-    """What only the diffusion expert has."""
+    """Params of the diffusion expert only."""
 
     draws: int = Field(default=3, ge=1, le=1000)
-    """Noises and steps of the schedule that each chunk is trained on at once: the context, which
-    costs most, is computed once for all of them."""
+    """Draws of noise and schedule step per chunk in a training step. The context, which costs most,
+    is computed once for all of them."""
     timesteps: int = Field(default=100, ge=2, le=10_000)
     """Steps of the noise schedule."""
     schedule: Literal["cosine", "linear"] = "cosine"
-    """How the noise grows over them."""
+    """How the noise grows over the steps."""
     prediction: Literal["epsilon", "sample", "v"] = "sample"
     """What the network predicts: the noise, the clean chunk, or the velocity between them."""
     sampler: Literal["ddpm", "ddim"] = "ddim"
-    """`ddpm` takes every step of the schedule, `ddim` as many as `sampling_steps`."""
+    """`ddpm` takes every step of the schedule, `ddim` takes `sampling_steps`."""
     sampling_steps: int = Field(default=4, ge=1, le=10_000)
-    """Of `ddim`; at most `timesteps`."""
+    """Steps of `ddim`; at most `timesteps`."""
     eta: float = Field(default=0.0, ge=0, le=1)
-    """Of `ddim`: 0 is deterministic after the first noise, 1 as random as `ddpm`."""
+    """Randomness of `ddim`: 0 is deterministic after the first noise, 1 is as random as `ddpm`."""
     clip: float | None = Field(default=5.0, gt=0, le=1e6)
     """The clean chunk is clipped to this many standard deviations in every sampling step."""
 
@@ -90,18 +90,18 @@ class DiffusionParams(Section):
 
 
 class FlowMatchingParams(Section):
-    """What only the flow-matching expert has."""
+    """Params of the flow-matching expert only."""
 
     draws: int = Field(default=3, ge=1, le=1000)
-    """As `diffusion.draws`: noises and times at once."""
+    """Draws of noise and time per chunk in a training step, as in `diffusion.draws`."""
     sampling_steps: int = Field(default=4, ge=1, le=10_000)
-    """Of the ODE solver."""
+    """Steps of the ODE solver."""
     solver: Literal["euler", "midpoint", "rk4"] = "euler"
-    """One, two or four evaluations of the network a step."""
+    """ODE solver: one, two or four evaluations of the network per step."""
     time: Literal["uniform", "beta"] = "beta"
-    """How times are drawn in training."""
+    """Distribution of the times in training."""
     alpha: float = Field(default=1.5, gt=0, le=1e3)
-    """Of the beta distribution of the noise's share 1 - t: above `beta`, noisy times are drawn
-    more often (Black et al. 2024)."""
+    """First parameter of the beta distribution of the noise's share 1 - t: larger than `beta` draws
+    noisy times more often (Black et al. 2024)."""
     beta: float = Field(default=1.0, gt=0, le=1e3)
-    """Of the beta distribution."""
+    """Second parameter of that beta distribution."""

@@ -21,7 +21,7 @@ _Paths = TypeVar("_Paths", Path, str, str | tuple[str, ...])
 
 
 def _without_home(paths: _Paths) -> _Paths:
-    """DVC takes `~` for a name, so it has no other meaning here either."""
+    """Refuse `~`, because DVC does not expand it."""
     for path in paths if isinstance(paths, tuple) else [str(paths)]:
         if path.startswith("~") and (place := os.path.expanduser(path)) != path:  # noqa: PTH111
             raise ValueError(f"~ is not expanded; write {place}")
@@ -35,9 +35,9 @@ def _bounded(path: Path) -> Path:
 
 
 Place = Annotated[Path, AfterValidator(_without_home), AfterValidator(_bounded)]
-"""A file or folder; its name leaves room for the endings of what is written beside it."""
+"""A file or folder; its name is short enough for the suffixes of files beside it."""
 PathOrName = Annotated[str, AfterValidator(_without_home)]
-"""A path, or the id of something on the hub."""
+"""A path or a hub id."""
 Globs = Annotated[str | tuple[str, ...], AfterValidator(_without_home)]
 
 
@@ -54,7 +54,7 @@ Output = Annotated[Place, AfterValidator(_is_apart)]
 
 
 def _keeps_truth(value: Any, parsed: Any) -> bool:
-    """Whether no true or false became a number."""
+    """Whether no true or false was turned into a number."""
     if isinstance(value, dict) and isinstance(parsed, dict):
         return all(_keeps_truth(inner, parsed.get(key)) for key, inner in value.items())
     if isinstance(value, list | tuple) and isinstance(parsed, list | tuple):

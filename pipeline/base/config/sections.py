@@ -59,7 +59,7 @@ class Params(Section):
 
 
 def described_keys(sections: Sequence[str]) -> list[str]:
-    """Every key of these sections: a line with its default, and its meaning below."""
+    """Every key of these sections: a line with its default, then its meaning."""
     lines: list[str] = []
     for name in sections:
         section = Params.model_fields[name].annotation
