@@ -97,8 +97,8 @@ def test_a_shorthands_value_is_checked_as_the_key_is(capsys):
 def test_keys_are_listed_with_defaults_and_meaning(capsys):
     assert run("Summary.", print, ["--keys"], sections=("verify", "train_head")) == 0
     said = capsys.readouterr().out
-    assert "verify: What is checked of a store." in said
-    assert "  verify.reextract = 0\n      Random rows that are computed again" in said
+    assert "verify: What is checked in a store." in said
+    assert "  verify.reextract = 0\n      Number of random rows to compute again" in said
     assert "  train_head.expert.dim = " in said
     assert '  train_head.output = "models/head"\n' in said
     assert "extract.store" not in said.replace("`extract.store`", "")

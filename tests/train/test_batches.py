@@ -163,7 +163,7 @@ def test_waiting_is_measured(store: FeatureStore, monkeypatch: pytest.MonkeyPatc
 
 def test_a_disabled_encoder_costs_a_single_reading() -> None:
     params = TrainHeadParams(sensor_enabled=False, sensor_window=650, state_window=10)
-    assert Windows.of(params) == Windows(8, 1, 10, 0.1, 1.0)
+    assert Windows.of(params) == Windows(8, 1, 20, 0.1, 2.0)  # the state reaches back to the frame
     assert Windows.of(TrainHeadParams(robot_state_enabled=False)).state_window == 1
 
 
