@@ -167,7 +167,7 @@ class TrainHeadParams(Section):
     """
     eval_every: int = Field(default=50, ge=1, le=10**9)
     """Steps between evaluations on the ticks of val."""
-    eval_samples: int = Field(default=4, ge=1, le=1000)
+    eval_samples: int = Field(default=1, ge=1, le=1000)
     """Chunks sampled per tick; the error of one chunk is averaged over them. Experts that do not
     sample give one."""
     early_stopping: int | None = Field(default=None, ge=1, le=10**9)
