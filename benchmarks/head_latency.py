@@ -24,7 +24,7 @@ from pipeline.policy.normalization import ChannelStatistics, Normalization
 from pipeline.policy.observation import PolicyShape
 from pipeline.policy.policy import Policy
 from pipeline.policy.shape import channel_kinds
-from pipeline.robot.export import Head, check_packages, export_head, onnx_session
+from pipeline.robot.export import Head, export_head, onnx_session
 from pipeline.robot.export_inputs import Inputs, random_inputs
 
 EXPERTS: tuple[ModelType, ...] = ("regression", "diffusion", "flow_matching")
@@ -127,7 +127,6 @@ def build_ways(
     files: list[Path] = []
     try:
         wide = ExportParams(output=folder, formats=("onnx",))
-        check_packages(wide)
         receipt = export_head(checkpoint, "", wide, lambda said: None)
         for name, file in receipt["files"].items():
             notes[f"{name} off by (training std)"] = file["deviation"]["random"]["std"]

@@ -154,9 +154,11 @@ def load_policy(folder: Path) -> PolicyCheckpoint:
     path = folder / WEIGHTS
     described = _described_weights(folder, document)
     # Of training alone, and absent from policies that were trained before it was there.
-    direct = {n: torch.zeros(shape) for n, (_, shape) in described.items() if ".direct." in n}
-    weights = direct | dict(read_tensors(path, document.weights_sha256))
-    _check_tensors(path, weights, described)
+    weights = dict(read_tensors(path, document.weights_sha256))
+    absent = {name for name in described.keys() - weights.keys() if ".direct." in name}
+    kept = {name: layout for name, layout in described.items() if name not in absent}
+    _check_tensors(path, weights, kept)
+    weights |= {name: torch.zeros(described[name][1]) for name in absent}
     return PolicyCheckpoint(
         params=document.params.train_head,
         shape=document.shape,

@@ -258,7 +258,8 @@ class Policy(Trainable):
                 newest = min(values.shape[1], self.params.state_window)
                 values, ages = values[:, -newest:], ages[:, -newest:]
                 oldest_s = (self.params.state_window_s or torch.inf) + CLOCK_SLACK_S
-                valid = valid.clamp(max=newest) - (ages > oldest_s).sum(dim=1)
+                older = (ages > oldest_s).sum(dim=1)
+                valid = (valid.clamp(max=newest) - older).clamp(min=0)
             values = expand(values, self.shape.kinds)
         values = normalizer.normalize(values).clamp_(-_LARGEST, _LARGEST)
         return encoder(values, valid, ages).unsqueeze(1)

@@ -27,13 +27,17 @@ class KeyMap:
     def apply(self, given: Mapping[str, Any], views: Sequence[str]) -> dict[str, Any]:
         """The fields under the policy's names; what is not known keeps its name.
 
-        An image may have its channels first. Raises `ObservationError` where a part of the state
-        is missing, or is no number.
+        An image whose name is that of a view stays that view; the others are the views in order,
+        and those beyond the views are left out. An image may have its channels first. Raises
+        `ObservationError` where a part of the state is missing, or is no number.
         """
-        fields = dict(given)
-        for name, view in zip(self.images, views, strict=False):
-            if name in fields:
-                fields[f"images/{view}"] = _channels_last(fields.pop(name))
+        fields = {name: value for name, value in given.items() if name not in self.images}
+        own = [f"images/{view}" for view in views]
+        named = not {*own}.isdisjoint(self.images)
+        places = {n: n for n in own} if named else dict(zip(self.images, own, strict=False))
+        for name, place in places.items():
+            if name in given:
+                fields[place] = _channels_last(given[name])
         parts = [name for name in self.state if name in fields]
         if parts and len(parts) < len(self.state):
             missing = ", ".join(name for name in self.state if name not in parts)

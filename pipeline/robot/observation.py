@@ -23,6 +23,7 @@ LARGEST_SEED: Final = 2**63
 
 STREAMS: Final = ("state", "sensor")
 _STILL: Final = 10
+_STILL_S: Final = 2.0
 _HINT: Final = ". For a client with openpi's names of a robot set serve.transform on the server"
 
 
@@ -172,14 +173,14 @@ class ObservationReader:
 class Doubts:
     """What cannot be true of the observations of an episode, each told once.
 
-    A frame of one value, a state of zeros, and a picture that `_STILL` frames in a row repeat to
-    the bit, which no camera does that runs.
+    A frame of one value, a state of zeros, and a picture that stays the same to the bit in `_STILL`
+    frames in a row over `_STILL_S` seconds: a camera that runs has noise.
     """
 
     def __init__(self) -> None:
         self._told = set[str]()
         self._last = dict[str, NDArray[np.uint8]]()
-        self._still = dict[str, int]()
+        self._still, self._since_s = dict[str, int](), dict[str, float]()
 
     def of(self, observation: RobotObservation) -> list[str]:
         """The new doubts about an observation, in words."""
@@ -192,10 +193,12 @@ class Doubts:
                 )
             same = last is not None and np.array_equal(last, frame)
             self._still[view] = self._still.get(view, 1) + 1 if same else 1
+            self._since_s[view] = self._since_s[view] if same else observation.time_s
             self._last[view] = frame
-            if self._still[view] >= _STILL:
+            still_s = observation.time_s - self._since_s[view]
+            if self._still[view] >= _STILL and still_s >= _STILL_S:
                 doubts[f"{name} still"] = (
-                    f"{name}: {_STILL} frames in a row are the same picture: does the camera run?"
+                    f"{name}: the same picture for {still_s:.1f} s: does the camera run?"
                 )
         state = observation.readings.get("state")
         if state is not None and not state.any():
@@ -209,7 +212,7 @@ def _flat(given: Mapping[Any, Any]) -> dict[Any, Any]:
     """The fields with those of nested mappings: `{"images": {"a": x}}` as `{"images/a": x}`."""
     flat: dict[Any, Any] = {}
     for name, value in given.items():
-        inner = value if isinstance(value, Mapping) else {None: value}
+        inner = value if isinstance(value, Mapping) and value else {None: value}
         for key, own in inner.items():
             place = name if key is None else f"{name}/{key}"
             if place in flat:

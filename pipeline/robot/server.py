@@ -175,8 +175,8 @@ class PolicyServer:
         # Counted until its last observation is answered, which may be after it has left.
         self.status.connected += 1
         robot, answers, since_s = _address(connection), 0, monotonic()
-        self.status.note("connected", robot)
         try:
+            self.status.note("connected", robot)
             await connection.send(wire.pack(self._metadata))
             session = self._served.session(self._params.fresh, self._params.seed, self._key_map)
             code = None

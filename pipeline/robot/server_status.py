@@ -5,6 +5,7 @@ import math
 import threading
 from collections import deque
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from datetime import UTC, datetime
 from time import monotonic
 from typing import Any, Final, Literal
@@ -63,6 +64,7 @@ class ServerStatus:
         `robot` is an address. Events are the same where the host and the text are; slow answers of
         a host are.
         """
+        text = "".join(c if c.isprintable() else " " for c in text)  # a client forges no line
         key = (event, robot.rpartition(":")[0], "" if event == "slow" else text)
         with self._lock:
             now_s = monotonic()
@@ -84,7 +86,8 @@ class ServerStatus:
             self._newest["warnings"].append(record)
         more = f" ({skipped} more like it)" if skipped else ""
         line = f"{time} {robot} {event}{': ' if text else ''}{text}{more}"
-        self._say(json.dumps(record) if self._form == "json" else line)
+        with suppress(OSError):  # a log that is full or gone stops no robot
+            self._say(json.dumps(record) if self._form == "json" else line)
 
     def json(self) -> str:
         """The content of `/status.json`."""

@@ -151,6 +151,11 @@ def test_older_readings_tell_the_motion_and_nothing_else(
     assert policy.act(other).equal(policy.act(seen))
     other.state[:, -1] += 5.0
     assert not policy.act(other).equal(policy.act(seen))
+    none = torch.zeros(2, dtype=torch.int64)
+    tokens = policy.encode("state", seen, none)
+    assert tokens.equal(policy.encode("state", replace(seen, state=seen.state + 5.0), none)), (
+        "a state that is dropped is missing, however old its readings are"
+    )
 
 
 def test_an_exported_head_counts_likewise(

@@ -219,9 +219,22 @@ def test_what_cannot_be_true_is_doubted_once(reader: ObservationReader, observe:
     kept = {"images/View2": observe(0)["images/View2"]}
     new = [
         doubts.of(reader.read(observe(tick, state=state, state_time=None, **black, **kept)))
-        for tick in range(12)
+        for tick in range(24)
     ]
     assert [text.split(":")[0] for text in new[0]] == ["images/View1", "state"]
-    (still, other) = new[9]
-    assert still.startswith("images/View1: 10 frames") and other.startswith("images/View2: 10 f")
-    assert not any(new[1:9]) and not any(new[10:])
+    still = [text for texts in new[1:] for text in texts]
+    assert [text.split(" for")[0] for text in still] == [
+        f"images/{view}: the same picture" for view in ("View1", "View2")
+    ]
+    assert not any(new[1:20]), "two seconds"
+
+
+def test_a_view_of_an_images_name_stays_that_view() -> None:
+    aloha = KEY_MAPS["aloha"]
+    sent = {name: np.full((4, 6, 3), place) for place, name in enumerate(aloha.images)}
+    views = ["cam_high", "cam_left_wrist", "cam_low", "cam_right_wrist"]
+    for known in (views, views[1:3]):
+        taken = aloha.apply(sent, known)
+        assert taken.keys() == {f"images/{view}" for view in known}
+        assert all(taken[name] is sent[name] or (taken[name] == sent[name]).all() for name in taken)
+    assert [image[0, 0, 0] for image in aloha.apply(sent, ["View1", "View2"]).values()] == [0, 1]
