@@ -231,13 +231,14 @@ class ExportedHead:
         self._draws = given["noise"].shape[1] if "noise" in given else 0
         try:
             self._run = onnx_runner(path, threads=1)
-            off = f"{(away := _furthest(self._run, Head(policy).eval(), given, checkpoint)[1]):g}"
+            off = _furthest(self._run, Head(policy).eval(), given, checkpoint)[1]
+            answers = f"{off:g}"
         except Exception as error:  # the classes of ONNX Runtime's errors are its own
-            off, away = f"{type(error).__name__}: {error}", np.inf
-        if not away <= TOLERANCE:
+            off, answers = np.inf, f"{type(error).__name__}: {error}"
+        if not off <= TOLERANCE:
             raise CheckpointMismatch(
                 f"{path}: expected answers within {TOLERANCE:g} training std of the checkpoint's, "
-                f"found {off}. It is damaged, or the head of another checkpoint: run "
+                f"found {answers}. It is damaged, or the head of another checkpoint: run "
                 f"{command('export')} again."
             )
 

@@ -179,26 +179,25 @@ class Doubts:
 
     def __init__(self) -> None:
         self._told = set[str]()
-        self._last = dict[str, NDArray[np.uint8]]()
-        self._still, self._since_s = dict[str, int](), dict[str, float]()
+        self._last = dict[str, tuple[NDArray[np.uint8], int, float]]()
+        """Of each view the newest frame, how many in a row were equal to it, and since when."""
 
     def of(self, observation: RobotObservation) -> list[str]:
         """The new doubts about an observation, in words."""
         doubts: dict[str, str] = {}
         for view, frame in observation.frames.items():
-            name, last = f"images/{view}", self._last.get(view)
+            name, now_s = f"images/{view}", observation.time_s
+            last, times, since_s = self._last.get(view, (None, 0, now_s))
             if frame.min() == frame.max():
                 doubts[name] = (
                     f"{name}: every pixel is {frame.min()}: is the camera covered or off?"
                 )
-            same = last is not None and np.array_equal(last, frame)
-            self._still[view] = self._still.get(view, 1) + 1 if same else 1
-            self._since_s[view] = self._since_s[view] if same else observation.time_s
-            self._last[view] = frame
-            still_s = observation.time_s - self._since_s[view]
-            if self._still[view] >= _STILL and still_s >= _STILL_S:
+            if last is None or not np.array_equal(last, frame):
+                times, since_s = 0, now_s
+            self._last[view] = frame, times + 1, since_s
+            if times + 1 >= _STILL and now_s - since_s >= _STILL_S:
                 doubts[f"{name} still"] = (
-                    f"{name}: the same picture for {still_s:.1f} s: does the camera run?"
+                    f"{name}: the same picture for {now_s - since_s:.1f} s: does the camera run?"
                 )
         state = observation.readings.get("state")
         if state is not None and not state.any():

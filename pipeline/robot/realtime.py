@@ -39,6 +39,7 @@ from pipeline.robot.run_report import (
     RunReport,
     TickPart,
     TickTimer,
+    allowed_ms,
 )
 
 if TYPE_CHECKING:  # It writes images and parquet, which the loop does not need.
@@ -368,10 +369,10 @@ class _Run:
         took = self.report.answer_timings.document().get(ANSWER_PARTS[0])
         if took is None:
             return ""
-        allowed_ms = 500 * self.loop.executor.horizon / self.hz
+        half_ms = allowed_ms(self.loop.executor.horizon, self.hz)
         return (
             f": answers took {took['p50']:.0f} ms (median), {took['max']:.0f} ms at most; half of "
-            f"a chunk is {allowed_ms:.0f} ms"
+            f"a chunk is {half_ms:.0f} ms"
         )
 
     def act(self, tick: int, observed: Mapping[str, Any]) -> None:

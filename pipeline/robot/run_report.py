@@ -24,6 +24,11 @@ KEPT = 65536
 PERCENTILES = {"p50": 50.0, "p99": 99.0, "p99.9": 99.9}
 
 
+def allowed_ms(horizon: int, hz: float) -> float:
+    """How long an answer may take: half of a chunk of `horizon` steps at `hz`."""
+    return 500 * horizon / hz
+
+
 class Ring:
     """The newest `rows` rows (row, column) of float64, in a buffer that is never reallocated."""
 

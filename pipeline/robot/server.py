@@ -36,6 +36,7 @@ from pipeline.base.errors import ConfigError, ObservationError, PipelineError, W
 from pipeline.robot import wire
 from pipeline.robot.client import TOKEN_VARIABLE
 from pipeline.robot.key_maps import KEY_MAPS
+from pipeline.robot.run_report import allowed_ms
 from pipeline.robot.server_status import Event, ServerStatus
 from pipeline.robot.session import ServedPolicy, Session
 
@@ -112,9 +113,7 @@ class PolicyServer:
         if self._key_map is not None:
             self._key_map.refuse_more(served.metadata["streams"]["views"])
         self._metadata = served.metadata | {"transform": params.transform}
-        metadata = served.metadata
-        self._allowed_ms = 500 * metadata["horizon"] / metadata["action_hz"]
-        """Of an answer: half of a chunk, after which a robot's plan soon ends."""
+        self._allowed_ms = allowed_ms(served.metadata["horizon"], served.metadata["action_hz"])
         # One thread a robot, which has at most one unanswered observation.
         self._threads = ThreadPoolExecutor(params.max_connections, "robot")
         self._answering = 0
@@ -186,6 +185,7 @@ class PolicyServer:
                 del message
                 if isinstance(answer, str):
                     event, _, why = answer.partition(": ")
+                    self.status.busy += event == "busy"
                     self.status.note(cast("Event", event), robot, why)
                 answers += isinstance(answer, bytes)
                 await connection.send(answer)
@@ -243,7 +243,6 @@ class PolicyServer:
         """The answer to a message, in a thread of its own."""
         observation = session.take(wire.unpack(message, self._params.max_message_mb * 2**20))
         if busy:
-            self.status.busy += 1
             waiting = self._params.max_waiting
             return f"busy: {waiting} observations are waiting; the readings were taken"
         if observation.reset:

@@ -15,7 +15,7 @@ from pipeline.robot.run_report import Timings
 Event = Literal[
     "connected", "left", "episode", "slow", "warning", "busy", "refused", "error", "turned away"
 ]
-REFUSALS: Final = ("busy", "refused", "error", "turned away")
+_REFUSALS: Final = ("busy", "refused", "error", "turned away")
 _EACH: Final = ("connected", "left", "episode")
 """Events of which each is written."""
 _TIMED: Final = ("vlm_ms", "head_ms", "wait_ms", "infer_ms")
@@ -66,6 +66,8 @@ class ServerStatus:
         """
         text = "".join(c if c.isprintable() else " " for c in text)  # a client forges no line
         key = (event, robot.rpartition(":")[0], "" if event == "slow" else text)
+        time = datetime.now(UTC).isoformat(timespec="milliseconds")
+        record: dict[str, Any] = {"time": time, "event": event, "robot": robot, "text": text}
         with self._lock:
             now_s = monotonic()
             repeats = now_s - self._written_s.get(key, -math.inf) < _QUIET_S
@@ -76,14 +78,12 @@ class ServerStatus:
                 self._written_s.clear()
                 self._skipped.clear()
             self._written_s[key] = now_s
-            skipped = self._skipped.pop(key, 0)
-        time = datetime.now(UTC).isoformat(timespec="milliseconds")
-        record = {"time": time, "event": event, "robot": robot, "text": text}
-        record |= {"skipped": skipped} if skipped else {}
-        if event in REFUSALS:
-            self._newest["refusals"].append(record)
-        elif event == "warning":
-            self._newest["warnings"].append(record)
+            if skipped := self._skipped.pop(key, 0):
+                record["skipped"] = skipped
+            if event in _REFUSALS:
+                self._newest["refusals"].append(record)
+            elif event == "warning":
+                self._newest["warnings"].append(record)
         more = f" ({skipped} more like it)" if skipped else ""
         line = f"{time} {robot} {event}{': ' if text else ''}{text}{more}"
         with suppress(OSError):  # a log that is full or gone stops no robot
@@ -93,9 +93,9 @@ class ServerStatus:
         """The content of `/status.json`."""
         with self._lock:
             answered, latency = self._timings.count, self._timings.document()
+            newest = {name: [*events] for name, events in self._newest.items()}
         counts = {"connected": self.connected, "answered": answered}
         counts |= {"refused": self.refused, "busy": self.busy}
         seconds = monotonic() - self._since_s
         document = {"policy": self._policy, "seconds": seconds, "counts": counts}
-        newest = {name: [*events] for name, events in self._newest.items()}
         return json.dumps(document | {"latency": latency} | newest)
