@@ -23,7 +23,7 @@ COMMANDS = {
     "before you begin, and to look": ("doctor", "inspect", "probe", "compare"),
     "the model itself": ("finetune",),
     "stores": ("verify", "store", "archive"),
-    "on a robot": ("serve", "export"),
+    "on a robot": ("serve", "drive", "export"),
 }
 """All commands, by what they are for."""
 

@@ -68,3 +68,7 @@ class ServerError(PipelineError, ConnectionError):
 
 class ServerBusy(ServerError):
     """A policy server has too many observations waiting; the connection stays."""
+
+
+class RobotStopped(PipelineError, RuntimeError):
+    """A run on a robot ended in a safe stop."""

@@ -25,6 +25,7 @@ from pipeline.base.config.stage_one import (
 )
 from pipeline.base.config.stage_two import (
     Chunking,
+    DriveParams,
     EvaluateParams,
     ExportParams,
     FinetuneParams,

@@ -18,6 +18,7 @@ from pipeline.base.config.stage_one import (
 )
 from pipeline.base.config.stage_two import (
     CompareParams,
+    DriveParams,
     EvaluateParams,
     ExportParams,
     FinetuneParams,
@@ -39,6 +40,7 @@ class Params(Section):
     evaluate: EvaluateParams = EvaluateParams()
     rollout: RolloutParams = RolloutParams()
     serve: ServeParams = ServeParams()
+    drive: DriveParams = DriveParams()
     export: ExportParams = ExportParams()
     finetune: FinetuneParams = FinetuneParams()
     compare: CompareParams = CompareParams()

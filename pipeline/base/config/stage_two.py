@@ -361,6 +361,44 @@ class ServeParams(Section):
     """How the line of each connection, episode, slow answer, warning and refusal is written."""
 
 
+class DriveParams(Section):
+    """Which robot is driven, by which policy, and what ends the run."""
+
+    robot: str = "pipeline.simulation.realtime:SimulatedRobot"
+    """`module:Class` of a class with `observe`, `frames`, `act` and `stop`, or with LeRobot's
+    interface; or `lerobot:TYPE`, an arm of an installed LeRobot, such as `lerobot:so101_follower`.
+    """
+    robot_args: dict[str, Any] = Field(default_factory=dict)
+    """The arguments of the class, or the config of LeRobot's arm (`port`, `cameras`, …)."""
+    cameras: dict[str, str] = Field(default_factory=dict)
+    """Cameras of a LeRobot arm by the policy's view; a view has the camera of its own name."""
+    motors: dict[str, str] = Field(default_factory=dict)
+    """Motors of a LeRobot arm by the policy's channel; a channel has the motor of its own name."""
+    camera_latency_s: float = Field(default=0.0, ge=0, le=10)
+    """How long an image of a LeRobot arm is on its way, for LeRobot gives no times."""
+    server: str | None = None
+    """Address of a running stages.serve, such as ws://192.168.1.5:8000. null: the policy runs in
+    this process. A token is taken from the environment variable VLA_SERVE_TOKEN."""
+    timeout_s: float = Field(default=10.0, gt=0, le=600)
+    """How long the server may take to connect, and to answer."""
+    checkpoint: Place | None = None
+    """Without a server: a training run's folder, or a checkpoint; `train_head.output` where null.
+    """
+    device: str = "auto"
+    """Without a server: auto, cpu, cuda or cuda:N."""
+    instruction: str | None = None
+    """What the robot is to do. null: the only instruction that the policy was trained on."""
+    limits: Place | None = None
+    """YAML file with the limits of motion, workspace and force. null: nothing is limited."""
+    runs: Output | None = Path("runs")
+    """Each run becomes a LeRobot data set `run_NNNNNN` in this folder. null: nothing is recorded.
+    """
+    seconds: float | None = Field(default=None, gt=0, le=1e6)
+    """How long the robot is driven. null: until something ends the run."""
+    settings: dict[str, Any] = Field(default_factory=dict)
+    """Other fields of `RunSettings` (`pipeline.robot.realtime`), such as `old_features_s`."""
+
+
 class ExportParams(Section):
     """Which policy's head is exported for other runtimes, and in which formats."""
 
