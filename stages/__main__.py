@@ -24,6 +24,7 @@ COMMANDS = {
     "the model itself": ("finetune",),
     "stores": ("verify", "store", "archive"),
     "on a robot": ("serve", "drive", "export"),
+    "to share": ("push",),
 }
 """All commands, by what they are for."""
 

@@ -70,5 +70,9 @@ class ServerBusy(ServerError):
     """A policy server has too many observations waiting; the connection stays."""
 
 
+class HubError(PipelineError, ConnectionError):
+    """The Hugging Face Hub cannot be reached, or refuses a request."""
+
+
 class RobotStopped(PipelineError, RuntimeError):
     """A run on a robot ended in a safe stop."""

@@ -148,6 +148,7 @@ def judged_document(
             "model_type": params.model_type,
             "fusion_strategy": params.fusion_strategy,
             "step": checkpoint.step,
+            "weights": checkpoint.digest,
             "parameters": sum(count for _, count in policy.parameter_table()),
             "samples": drawn["samples"] if drawn else 1,
             "seed": params.seed,

@@ -89,7 +89,7 @@ def roll_out(
         for name in dict.fromkeys(wanted.ablations)
         if name.split()[0] in policy.encoders and not (alone and name.endswith("off"))
     ]
-    settings = {"checkpoint": name, "step": checkpoint.step}
+    settings = {"checkpoint": name, "step": checkpoint.step, "weights": checkpoint.digest}
     settings |= {"model_type": policy.params.model_type, "instruction": instruction}
     driver = _LocalDriver(checkpoint, policy, features, wanted, instruction, act or policy.act)
     return _run_episodes(driver, checkpoint.source, ablations, wanted, settings, say)

@@ -66,6 +66,8 @@ class PolicyCheckpoint:
     """Of the store's episodes; empty where an earlier version wrote the checkpoint."""
     golden: tuple[GoldenRow, ...] = ()
     """Empty where the store has none, or an earlier version wrote the checkpoint."""
+    digest: str = ""
+    """SHA-256 of the weights' file; empty before the checkpoint is saved."""
 
     def policy(self, device: "torch.device | str" = "cpu") -> "Policy":
         """The policy with these weights, in evaluation mode; it knows its feature spec."""
@@ -170,6 +172,7 @@ def load_policy(folder: Path) -> PolicyCheckpoint:
         instructions=document.instructions,
         weights=weights,
         golden=_read_golden(folder, document),
+        digest=document.weights_sha256,
     )
 
 

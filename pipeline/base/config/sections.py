@@ -26,7 +26,13 @@ from pipeline.base.config.stage_two import (
     ServeParams,
     TrainHeadParams,
 )
-from pipeline.base.config.stores import ArchiveParams, ProbeParams, StoresParams, VerifyParams
+from pipeline.base.config.stores import (
+    ArchiveParams,
+    ProbeParams,
+    PushParams,
+    StoresParams,
+    VerifyParams,
+)
 
 
 class Params(Section):
@@ -48,6 +54,7 @@ class Params(Section):
     archive: ArchiveParams = ArchiveParams()
     probe: ProbeParams = ProbeParams()
     stores: StoresParams = StoresParams()
+    push: PushParams = PushParams()
     inspect: InspectParams = InspectParams()
 
     @model_validator(mode="after")

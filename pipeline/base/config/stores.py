@@ -92,6 +92,20 @@ class ProbeParams(Section):
     """Folder of the table and the picture."""
 
 
+class PushParams(Section):
+    """Which policy or store is uploaded to the Hugging Face Hub, and where to."""
+
+    repo: str = ""
+    """The repository, as owner/name. It is made if there is none."""
+    folder: Place | None = None
+    """A trained policy, a finished store or an archive. null: `train_head.output`."""
+    private: bool = True
+    """Whether a new repository is private. A policy carries a few camera frames (golden rows), a
+    store all streams: look at them before you publish."""
+    card_only: bool = False
+    """Print the card and the list of files, and upload nothing."""
+
+
 class StoresParams(Section):
     """Housekeeping among the stores of a folder."""
 

@@ -1,0 +1,238 @@
+"""A policy or a store on the Hugging Face Hub: a card made of its own figures, and the upload."""
+
+import json
+import sys
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from pipeline.base.config import Params
+from pipeline.base.errors import HubError, StoreMismatch
+from pipeline.base.table import Table
+from pipeline.policy.checkpoint import DOCUMENT, PolicyCheckpoint, find_policy, load_policy
+from pipeline.store import FeatureStore
+from pipeline.vlm.checkpoint_folder import could_be_hub_id, folder_here
+
+if TYPE_CHECKING:
+    from huggingface_hub import HfApi
+
+_LIBRARY = "vla-feature-cache"
+_NOT_JUDGED = "No evaluation or rollout of these weights was at hand."
+_LISTED = 20
+"""The most files that `push.card_only` lists."""
+
+
+def push(params: Params, api: "HfApi", say: Callable[[str], None] = print) -> None:
+    """Upload what `push` names, with its card, in one commit; `push.card_only` prints the card.
+
+    Raises `HubError` where the Hub cannot be reached or refuses, `StoreMismatch` for a folder that
+    is neither a policy nor a store, and what opening it raises.
+    """
+    wanted = params.push
+    folder = wanted.folder or params.train_head.output
+    if (folder / "zarr.json").exists():
+        kind, files = "dataset", _files_below(folder)
+        card = store_card(FeatureStore.open(folder), wanted.repo)
+    elif any((place / DOCUMENT).exists() for place in (folder, folder / "best")):
+        folder = find_policy(folder)
+        kind, files = "model", _files_below(folder)
+        reports = {"evaluate": params.evaluate.output, "rollout": params.rollout.output}
+        card = policy_card(load_policy(folder), wanted.repo, params.vlm.checkpoint, reports)
+    else:
+        raise StoreMismatch(
+            f"push.folder: {folder}: expected a trained policy or a finished store. Run "
+            "stages.train_head, or name another folder"
+        )
+    if wanted.card_only:
+        say(card)
+        largest = sorted(files.items(), key=lambda file: -file[1][1])
+        for name, (_, size) in largest[:_LISTED]:
+            say(f"{size / 1e6:10.2f} MB  {name}")
+    size = sum(size for _, size in files.values())
+    say(f"{folder}: {len(files)} files, {size / 1e6:.1f} MB, for the {kind} {wanted.repo}")
+    if not wanted.card_only:
+        say(_upload(api, wanted.repo, kind, wanted.private, files, card))
+
+
+def _files_below(folder: Path) -> dict[str, tuple[Path, int]]:
+    """Each file by its name in the repository, with its size in bytes."""
+    paths = sorted(path for path in folder.rglob("*") if path.is_file())
+    return {path.relative_to(folder).as_posix(): (path, path.stat().st_size) for path in paths}
+
+
+def _upload(
+    api: "HfApi",
+    repo: str,
+    kind: str,
+    private: bool,
+    files: Mapping[str, tuple[Path, int]],
+    card: str,
+) -> str:
+    """One commit with all files and the card; returns its address."""
+    from huggingface_hub import CommitOperationAdd
+    from huggingface_hub.errors import HfHubHTTPError, HFValidationError, LocalTokenNotFoundError
+
+    operations = [CommitOperationAdd(name, path) for name, (path, _) in files.items()]
+    operations.append(CommitOperationAdd("README.md", card.encode()))
+    try:
+        api.create_repo(repo, repo_type=kind, private=private, exist_ok=True)
+        commit = api.create_commit(
+            repo, operations, commit_message=f"Upload by {_LIBRARY}", repo_type=kind
+        )
+    except (HfHubHTTPError, HFValidationError, LocalTokenNotFoundError, *_network()) as error:
+        why = str(error).strip().splitlines()[0]
+        raise HubError(
+            f"push.repo: {repo}: {why}. Log in with a token that may write (hf auth login), and "
+            "name a repository of yours as owner/name"
+        ) from error
+    return commit.commit_url
+
+
+def _network() -> tuple[type[Exception], ...]:
+    """The errors of a network that fails; releases of huggingface_hub differ in their client."""
+    clients: list[Any] = [sys.modules[name] for name in ("httpx", "httpx2") if name in sys.modules]
+    return OSError, *(client.TransportError for client in clients)
+
+
+def policy_card(
+    checkpoint: PolicyCheckpoint, repo: str, model: str, reports: Mapping[str, Path]
+) -> str:
+    """The card of a policy: what it is, what it needs, and how it was judged.
+
+    `reports` has the folders of its evaluation and its rollouts. Figures of another policy or
+    another step are left out.
+    """
+    source, params = checkpoint.source, checkpoint.params
+    streams, spec = source["streams"], source["feature_spec"]
+    action = streams["action"]
+    about = {
+        "action expert": f"{params.model_type}, fusion {params.fusion_strategy}",
+        "actions": f"{params.horizon} steps of {_channels(action)}, {action['kind']}",
+        "rate": f"{source['action_hz']:g} Hz" if source["action_hz"] else "as recorded",
+        "cameras": ", ".join(streams["views"]),
+        "state": _channels(streams["state"]) if "state" in streams else "none",
+        "sensor": _channels(streams["sensor"]) if "sensor" in streams else "none",
+        "instructions": "; ".join(checkpoint.instructions),
+        "trained on": f"{len(checkpoint.split['train'])} episodes, {checkpoint.step} steps",
+    }
+    lines = [
+        *_front("model", repo, model),
+        "A policy on features of a frozen Qwen2.5-VL, trained by vla-feature-cache.",
+        *_section("What it is", _facts(about)),
+        *_section(
+            "What it needs",
+            [
+                f"The features of `{model}` with this feature spec (`{spec['digest']}`): layers, "
+                f"pooling, image size and prompt are in `{DOCUMENT}`. Before it serves, the "
+                "model proves on golden rows that it gives them.",
+                "```",
+                f"hf download {repo} --local-dir models/{repo.split('/')[-1]}",
+                f"python -m stages.serve --set serve.checkpoint=models/{repo.split('/')[-1]}",
+                "```",
+            ],
+        ),
+        *_section("How it was judged", list(_judged(checkpoint, reports)) or [_NOT_JUDGED]),
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def store_card(store: FeatureStore, repo: str) -> str:
+    """The card of a store: what it holds, and how to train from it."""
+    streams, spec = store.streams, store.spec
+    slots, dim = store.feature_shape
+    about = {
+        "episodes": f"{len(store.episodes):,}",
+        "ticks": f"{store.ticks:,}",
+        "features": f"{slots} slots of {dim} in {spec['storage_dtype']}",
+        "feature spec": f"`{spec['digest']}`",
+        **{
+            name: _channels(streams[name])
+            for name in ("action", "state", "sensor")
+            if name in streams
+        },
+    }
+    folder = f"cache_store/{repo.split('/')[-1]}.zarr"
+    lines = [
+        *_front("dataset", repo, None),
+        "Features of a frozen Qwen2.5-VL with the raw sensor, state and action streams, written by "
+        "vla-feature-cache: a plain zarr v3 group that is mapped into memory for training.",
+        *_section("What it holds", _facts(about)),
+        *_section(
+            "Train from it",
+            [
+                "```",
+                f"hf download {repo} --repo-type dataset --local-dir {folder}",
+                f"python -m stages.verify --set verify.store={folder}",
+                f"python -m stages.train_head --set train_head.store={folder}",
+                "```",
+            ],
+        ),
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def _front(kind: str, repo: str, model: str | None) -> list[str]:
+    """The metadata in front of a card, and its title."""
+    entries = [f"library_name: {_LIBRARY}", "tags: [robotics, vision-language-action]"]
+    if kind == "model":
+        entries.append("pipeline_tag: robotics")
+    if model is not None and could_be_hub_id(model) and folder_here(model) is None:
+        entries.append(f"base_model: {model}")
+    return ["---", *entries, "---", f"# {repo.split('/')[-1]}"]
+
+
+def _section(title: str, lines: Sequence[str]) -> list[str]:
+    return ["", f"## {title}", *lines]
+
+
+def _facts(about: Mapping[str, str]) -> list[str]:
+    return Table(("", " "), list(about.items())).markdown()
+
+
+def _channels(stream: Mapping[str, Any]) -> str:
+    """The names and units of a stream's channels, the first of many."""
+    pairs = [
+        f"{n} [{unit}]" if unit else n
+        for n, unit in zip(stream["names"], stream["units"], strict=True)
+    ]
+    return ", ".join(pairs) if len(pairs) <= 30 else f"{len(pairs)}: {', '.join(pairs[:5])}, …"
+
+
+def _judged(checkpoint: PolicyCheckpoint, reports: Mapping[str, Path]) -> Iterator[str]:
+    """Success and errors of this policy, by the documents of its evaluation and its rollouts."""
+    rollout, metrics = (_document(reports["rollout"], name) for name in ("settings", "metrics"))
+    if rollout.get("weights") == checkpoint.digest:
+        yield (
+            f"In {rollout['episodes']} closed-loop episodes of `{rollout['environment']}`, level "
+            f"`{rollout['level']}`, with 95 % intervals:"
+        )
+        yield ""
+        rows = [
+            (name, f"{rate['rate']:.0%} ({rate['low']:.0%} to {rate['high']:.0%})")
+            for name, rate in metrics["success"].items()
+        ]
+        yield from Table(("controller", "success"), rows).markdown()
+    judged, metrics = (_document(reports["evaluate"], name) for name in ("judged", "metrics"))
+    if judged.get("policy", {}).get("weights") == checkpoint.digest:
+        held_out = metrics["test"]
+        yield ""
+        yield f"Errors on {held_out['episodes']} held-out episodes, beside the best simple rule:"
+        yield ""
+        rows = [
+            (span, group, *(_interval(by[name]) for name in ("policy", "best_baseline")))
+            for span in ("executed", "chunk")
+            for group, by in metrics[span].items()
+            if "best_baseline" in by
+        ]
+        yield from Table(("steps", "error", "policy", "best simple rule"), rows).markdown()
+
+
+def _document(folder: Path, name: str) -> dict[str, Any]:
+    """A JSON document of a report; empty where there is none."""
+    path = folder / f"{name}.json"
+    return json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
+
+
+def _interval(figure: Mapping[str, float]) -> str:
+    value = f"{figure['value']:.3g}"
+    return f"{value} ({figure['low']:.3g} to {figure['high']:.3g})" if "low" in figure else value
