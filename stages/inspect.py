@@ -10,6 +10,7 @@ written, whatever was found, and 2 if there was nothing to look at.
   python -m stages.inspect cache_store/NAME.zarr   a store
   python -m stages.inspect PATH --set inspect.episodes=10
                                                    ten episodes in detail
+  python -m stages.inspect PATH --rerun            episodes to scrub through, in Rerun
 
 The page of PATH goes into a folder of its own in reports/inspect, named after PATH; without PATH it
 goes into reports/inspect itself, and with --set inspect.output=FOLDER always into that one. Looking
@@ -31,6 +32,7 @@ SHORTHANDS = (
     Shorthand(
         "path", "inspect.path", "recordings, folders or globs of them, or a store", "PATH", "*"
     ),
+    Shorthand("--rerun", "inspect.rerun", "write Rerun files, to scrub through, and no page"),
 )
 SHOWN = 8
 """The most findings that the terminal shows."""
@@ -45,6 +47,14 @@ def main(params: "Params") -> None:
     from pipeline.look.subject import subject_of
 
     subject = subject_of(params)
+    if params.inspect.rerun:
+        from pipeline.look.scrubbing import write_episodes
+
+        for folder in (params.inspect.output, subject.folder):
+            claim(folder, REPORT)
+        for path in write_episodes(subject, params):
+            print(f"{path}: {path.stat().st_size / 1e6:.1f} MB; open it with: rerun {path}")
+        return
     report = _report(subject, params)
     for folder in (params.inspect.output, subject.folder):
         claim(folder, REPORT)

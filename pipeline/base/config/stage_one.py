@@ -205,6 +205,8 @@ class InspectParams(Section):
     """Most VL rows of a store in a picture, evenly spread."""
     seed: Seed = 0
     """Seed of the choice of samples."""
+    rerun: bool = False
+    """Write `episodes` episodes, evenly spread, as Rerun files (.rrd) in place of the page."""
     output: Output = Path("reports/inspect")
     """Folder of the page and its pictures. By default each `path` has its own folder in
     reports/inspect, so that one inspection does not replace the page of another."""
