@@ -19,7 +19,7 @@ from pipeline.vlm.extractor import Extractor
 from pipeline.vlm.vision import VisionTower
 
 _STEPS: tuple[tuple[str, Any, str], ...] = (
-    ("key", "pipeline.base.golden", "row_key"),
+    ("key", "pipeline.base.source", "row_key"),
     ("resize", "pipeline.vlm.preparation", "stretch"),
     ("collate", Extractor, "collate"),
     ("patchify", "pipeline.vlm.extractor", "patchify"),

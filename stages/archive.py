@@ -19,7 +19,7 @@ from stages.command import Shorthand, run
 
 if TYPE_CHECKING:
     from pipeline.base.config import Params
-    from pipeline.base.table import Table
+    from pipeline.base.text import Table
     from pipeline.store.archive import Manifest
 
 SECTIONS = ("archive",)
@@ -51,7 +51,7 @@ def main(params: "Params") -> None:
 
 def _table(manifest: "Manifest") -> "Table":
     """Each array: size, how much smaller it became, codec."""
-    from pipeline.base.table import Table
+    from pipeline.base.text import Table
 
     sizes = [
         (name, array.raw_bytes, sum(array.shard_bytes), array.codec)

@@ -21,7 +21,7 @@ from stages.command import run
 
 if TYPE_CHECKING:
     from pipeline.base.config import Params
-    from pipeline.base.issue import Issue
+    from pipeline.base.errors import Issue
 
 SECTIONS = ("data", "vlm", "extract", "train_head")
 

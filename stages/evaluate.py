@@ -25,8 +25,8 @@ SECTIONS = ("evaluate",)
 
 def main(params: "Params") -> None:
     """Evaluate the checkpoint that `evaluate` names, else what `train_head` wrote."""
-    from pipeline.base.device import resolve_device
     from pipeline.base.files import REPORT, refuse_foreign
+    from pipeline.base.machine import resolve_device
     from pipeline.evaluate.evaluation import evaluate_checkpoint
     from pipeline.evaluate.tables import ablation_text, error_text
     from pipeline.policy.checkpoint import find_policy, load_policy

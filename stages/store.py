@@ -94,7 +94,7 @@ def _merge(params: "StoresParams") -> None:
 
 def _gc(params: "StoresParams") -> None:
     from pipeline.base.errors import StoreLocked
-    from pipeline.base.format import size
+    from pipeline.base.text import size
     from pipeline.store.inventory import (
         describe_kept,
         fate_of,

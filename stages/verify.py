@@ -68,7 +68,7 @@ def main(params: "Params") -> None:
 
 def _prove(params: "Params") -> None:
     """Compute the checkpoint's golden rows again, on the same device as `stages.serve`."""
-    from pipeline.base.device import resolve_device
+    from pipeline.base.machine import resolve_device
     from pipeline.policy.checkpoint import find_policy, load_policy
     from pipeline.robot.live_features import LiveFeatures, prove
 

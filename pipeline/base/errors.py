@@ -1,9 +1,13 @@
-"""The errors that a user can fix.
+"""The errors that a user can fix, and the issues that a check finds.
 
 A stage prints a `PipelineError` without a traceback and exits with 2. The message says the expected
 and the actual value, the place, and what to run next. Each subclass is also the builtin error that
 a caller would catch without knowing this package.
 """
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
 
 
 class PipelineError(Exception):
@@ -76,3 +80,30 @@ class HubError(PipelineError, ConnectionError):
 
 class RobotStopped(PipelineError, RuntimeError):
     """A run on a robot ended in a safe stop."""
+
+
+Severity = Literal["error", "warning", "note", "ok"]
+"""error: a stage cannot use it. note: it could be better. ok: it was checked."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Issue:
+    """One checked thing and its state; times are float64 seconds on the episode's own clock."""
+
+    severity: Severity
+    kind: str
+    """As explained in docs/looking.md: `gap`, `dead camera`, …"""
+    message: str
+    """One line with the expected and the actual value."""
+    source: str = ""
+    episode: str = ""
+    stream: str = ""
+    """`view View1`, `sensor`, `state`, …, or an array of a store; empty where it concerns all."""
+    start_s: float | None = None
+    """None where it concerns the whole stream."""
+    stop_s: float | None = None
+    file: Path | None = None
+    chunk: int | None = None
+    """The chunk of the array, if it concerns only one chunk file."""
+    remedy: str = ""
+    """What to install, set or run."""

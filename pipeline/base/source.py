@@ -1,11 +1,23 @@
-"""Documents that a store and a policy share: feature spec, streams, clocks."""
+"""Where features come from, as recordings, stores, adapters and policies share it.
 
+Feature spec, streams and clocks; golden rows, with whose frames the features can be computed again
+on another machine and without a recording; and the episodes that the model was tuned on.
+"""
+
+import hashlib
 import re
-from typing import Annotated, Literal, Self
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self
 
-from pydantic import AfterValidator, Field, model_validator
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import AfterValidator, Field, Strict, model_validator
 
-from pipeline.base.border import Document, Text
+from pipeline.base.border import Border, Document, Text
+from pipeline.base.errors import StoreIncomplete
+from pipeline.base.files import read_document, write_with_digest
 
 
 def is_view_name(name: str) -> bool:
@@ -91,3 +103,146 @@ class SourceDocument(Document):
     streams: Streams
     action_hz: Annotated[float, Field(gt=0, le=10**6)] | None
     vlm_reuse_count: Annotated[int, Field(ge=1, le=10**6)]
+
+
+MOST_GOLDEN = 4
+"""Most golden rows in a store."""
+
+Frames = Mapping[str, NDArray[np.uint8]]
+"""View -> (height, width, 3) RGB as decoded, before any resize; without missing views."""
+
+
+@dataclass(frozen=True, eq=False)
+class GoldenRow:
+    """A VL row with all inputs of its features, and the stored features."""
+
+    key: bytes
+    """`row_key` of its feature spec, prompt and frames."""
+    instruction: str
+    prompt: str
+    """The rendered prompt."""
+    frames: Frames
+    features: NDArray[np.float32]
+    """(slot, dim), of the plain frames."""
+    slot_valid: NDArray[np.bool_]
+    """(slot,)"""
+
+
+def row_key(spec_digest: str, views: Sequence[str], prompt: str, frames: Frames) -> bytes:
+    """16 bytes that differ for every other spec, rendered prompt or frames in view order."""
+    digest = hashlib.blake2b(digest_size=16)
+    for text in (spec_digest, prompt):
+        _add(digest, text.encode())
+    for view in views:
+        if view in frames:
+            frame = np.ascontiguousarray(frames[view])
+            _add(digest, f"{view} {frame.shape} {frame.dtype}".encode())
+            digest.update(frame.data)
+    return digest.digest()
+
+
+def spread(rows: NDArray[np.int64], views: NDArray[np.int64]) -> NDArray[np.int64]:
+    """At most `MOST_GOLDEN` of these rows, evenly spread over those with the most views.
+
+    `views` (row,) is the number of views of each row.
+    """
+    full = rows[views == views.max(initial=0)]
+    places = np.linspace(0, max(0, len(full) - 1), min(MOST_GOLDEN, len(full)))
+    return full[np.unique(places.round().astype(np.int64))]
+
+
+def _add(digest: "hashlib.blake2b", part: bytes) -> None:
+    # The length comes first, so that a character moved to the next part changes the key.
+    digest.update(len(part).to_bytes(8, "little"))
+    digest.update(part)
+
+
+TUNED_ON = "tuned_on.json"
+"""The file in the folder of an adapter or a tuned checkpoint; not part of its digest."""
+_ATTRIBUTE = "tuned_on"
+"""The attribute of a store whose model has such a file."""
+_STORE = Border(StoreIncomplete, "Copy the store again, or extract it anew with stages.extract.")
+
+Tick = Annotated[int, Field(ge=0, le=10**12)]
+Side = Literal["train", "val", "test"]
+SIDES: tuple[Side, ...] = ("train", "val", "test")
+
+
+class EpisodePart(Document):
+    """The ticks of one episode on one side of a split."""
+
+    ticks: Annotated[tuple[Tick, Tick], Strict(False)]
+    """[first, stop), counted from the episode's first tick."""
+    content: Text
+    """Digest of the episode's files."""
+    group: Text
+    """Episodes of one group are on one side; a single episode may be split by time."""
+
+    @model_validator(mode="after")
+    def _has_ticks(self) -> Self:
+        if self.ticks[0] >= self.ticks[1]:
+            raise ValueError(f"ticks: expected the first before the last, found {self.ticks}")
+        return self
+
+
+class TunedPart(EpisodePart):
+    """The ticks of one episode that a model has seen."""
+
+    episode: Text
+    """"source/id"."""
+
+
+class TunedOn(Document):
+    """The episodes that a model was tuned on, and those that chose its best step."""
+
+    train: Annotated[tuple[TunedPart, ...], Strict(False)] = ()
+    val: Annotated[tuple[TunedPart, ...], Strict(False)] = ()
+
+    @classmethod
+    def of_split(cls, split: Mapping[Side, Mapping[str, EpisodePart]]) -> "TunedOn":
+        """The train and val sides of a checkpoint's split."""
+        parts = {
+            side: [{"episode": name, **part.model_dump()} for name, part in split[side].items()]
+            for side in SIDES[:2]
+        }
+        return cls.model_validate(parts)
+
+
+def join_tuned_on(several: Iterable[TunedOn | None]) -> TunedOn | None:
+    """The episodes of several tunings, one after the other; None where nothing is known."""
+    known = [tuned for tuned in several if tuned is not None]
+    if not known:
+        return None
+    return TunedOn(
+        train=tuple(dict.fromkeys(part for tuned in known for part in tuned.train)),
+        val=tuple(dict.fromkeys(part for tuned in known for part in tuned.val)),
+    )
+
+
+def read_tuned_on(folder: Path) -> TunedOn | None:
+    """The episodes that the model in this folder was tuned on; None without such a file.
+
+    Raises `CheckpointIncomplete` where the file is damaged.
+    """
+    path = folder / TUNED_ON
+    return read_document(path, TunedOn)[0] if path.exists() else None
+
+
+def tuned_on_of_store(attributes: Mapping[str, Any], path: Path) -> TunedOn | None:
+    """The episodes that the model of the store at `path` was tuned on; None if unknown.
+
+    Raises `StoreIncomplete` where the attribute is damaged.
+    """
+    where = f"{path}, attribute {_ATTRIBUTE}"
+    document = attributes.get(_ATTRIBUTE)
+    return None if document is None else _STORE.parse(document, TunedOn, where)
+
+
+def tuned_on_attributes(tuned: TunedOn | None) -> dict[str, Any]:
+    """The attribute for a store; empty where nothing is known."""
+    return {} if tuned is None else {_ATTRIBUTE: tuned.model_dump(mode="json")}
+
+
+def write_tuned_on(folder: Path, tuned: TunedOn) -> None:
+    """Write `tuned` beside the weights. Raises `DiskFull`."""
+    write_with_digest(folder / TUNED_ON, tuned.model_dump(mode="json"))

@@ -16,7 +16,7 @@ from pipeline.base.border import Border, Document, Text
 from pipeline.base.config import FusionStrategy, ModelType
 from pipeline.base.differences import describe, differences
 from pipeline.base.errors import ConfigError
-from pipeline.base.table import Table
+from pipeline.base.text import Table
 from pipeline.evaluate.baselines import BASELINES, METHODS
 from pipeline.evaluate.evaluation import JUDGED
 from pipeline.evaluate.figures import Figure, draws

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.stats import binomtest
 
 from pipeline.base.config import latencies_ms
-from pipeline.base.table import Table
+from pipeline.base.text import Table
 from pipeline.simulation.insertion import InsertionTrace
 
 POLICY: Final = "policy"

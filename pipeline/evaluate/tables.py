@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from pipeline.base.channels import named
 from pipeline.base.files import write_document
-from pipeline.base.table import Table
+from pipeline.base.text import Table
 from pipeline.evaluate.ablation import AblationStudy
 from pipeline.evaluate.baselines import METHODS
 from pipeline.evaluate.evaluation import Evaluation

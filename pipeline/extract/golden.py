@@ -5,7 +5,7 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.base.golden import spread
+from pipeline.base.source import spread
 from pipeline.data.row_range import RowFrames
 from pipeline.extract.rows import row_frames
 from pipeline.extract.state import Say, StorePlaces

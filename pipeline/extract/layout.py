@@ -14,8 +14,8 @@ from pipeline.base.arrays import first_non_finite
 from pipeline.base.border import MOST_BYTES, Border
 from pipeline.base.errors import DiskFull, NumericsError, RecordingError
 from pipeline.base.files import free_bytes
-from pipeline.base.format import size
-from pipeline.base.tuned_on import store_attributes
+from pipeline.base.source import tuned_on_attributes
+from pipeline.base.text import size
 from pipeline.data import Stream
 from pipeline.data.timeline import Timeline, tick_hz
 from pipeline.extract.plan import store_bytes
@@ -177,5 +177,5 @@ def _attributes(checked: Sequence[CheckedEpisode], survey: Survey) -> dict[str, 
         "action_hz": tick_hz((episode.ticks.recorded_hz for episode in checked), data.action_hz),
         "vlm_reuse_count": data.vlm_reuse_count,
         "environment": [],
-        **store_attributes(tuned_on(survey.params.vlm)),
+        **tuned_on_attributes(tuned_on(survey.params.vlm)),
     }

@@ -5,7 +5,7 @@ from collections.abc import Iterator, Sequence
 from pipeline.base.config import setting
 from pipeline.base.digests import ContentDigests
 from pipeline.base.files import free_bytes
-from pipeline.base.format import duration, size
+from pipeline.base.text import duration, size
 from pipeline.extract.state import BuildState, StorePlaces, spec_differences
 from pipeline.extract.survey import CheckedEpisode, Survey
 from pipeline.store import FEATURES, RowSource, StoreBuild, read_plan
@@ -123,7 +123,7 @@ def _warnings(surveyed: Survey, before: RowSource | None, missing: int) -> Itera
         )
     # The devices of the workers of a dask scheduler are not known.
     if missing and params.vlm.dtype != "float32" and isinstance(params.extract.workers, int):
-        from pipeline.base.device import resolve_device  # torch takes a second to import
+        from pipeline.base.machine import resolve_device  # torch takes a second to import
 
         if resolve_device(params.extract.device).type == "cpu":
             yield (

@@ -16,7 +16,7 @@ from pipeline.base.config import Params
 from pipeline.base.differences import describe, differences
 from pipeline.base.digests import ContentDigests, ledger_path
 from pipeline.base.errors import StoreMismatch
-from pipeline.base.format import capped
+from pipeline.base.text import capped
 from pipeline.data.row_range import RowFrames
 from pipeline.extract.encoder import Encoder
 from pipeline.extract.rows import ReadyRow, RowPreparation

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 
 from pipeline.base.config import Params
-from pipeline.base.device import resolve_device
 from pipeline.base.digests import ContentDigests, ledger_path
-from pipeline.base.format import capped
+from pipeline.base.machine import resolve_device
+from pipeline.base.text import capped
 from pipeline.data.timeline import rate_notes
 from pipeline.extract.engine import Executor, ExtractionReport, compute_here, fill
 from pipeline.extract.golden import keep_golden

@@ -20,8 +20,8 @@ from pipeline.base.border import Border
 from pipeline.base.config import DataParams, Params
 from pipeline.base.digests import ContentDigests, joint_digest
 from pipeline.base.errors import RecordingError, StoreMismatch, VLMError
-from pipeline.base.format import capped
 from pipeline.base.source import RATE_TOLERANCE, Streams
+from pipeline.base.text import capped
 from pipeline.data import BadEpisode, Recording, content_digest, open_recordings
 from pipeline.data.episode import Embodiment, common_embodiment, read_episode
 from pipeline.data.recording import absolute

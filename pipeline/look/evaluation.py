@@ -13,7 +13,7 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from pipeline.base.digests import file_digest
-from pipeline.base.table import Table
+from pipeline.base.text import Table
 from pipeline.evaluate import tables
 from pipeline.evaluate.ablation import AblationStudy
 from pipeline.evaluate.baselines import METHODS

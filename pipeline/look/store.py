@@ -23,10 +23,8 @@ from pipeline.base.arrays import non_finite, widen
 from pipeline.base.channels import named
 from pipeline.base.commands import command
 from pipeline.base.config import InspectParams, setting
-from pipeline.base.errors import StoreIncomplete
-from pipeline.base.format import duration, size
-from pipeline.base.issue import Issue, Severity
-from pipeline.base.table import Table
+from pipeline.base.errors import Issue, Severity, StoreIncomplete
+from pipeline.base.text import Table, duration, size
 from pipeline.look.page.blocks import Block, Issues, Outline, Picture, Report, Section, Text
 from pipeline.look.page.style import GRID, PALETTE, draw_map, panels
 from pipeline.store import FEATURES, KEY_BYTES, Episode, FeatureStore, check_trailers, episode_name

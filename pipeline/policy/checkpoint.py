@@ -27,8 +27,7 @@ from pipeline.base.files import (
     write_tensors,
     write_with_digest,
 )
-from pipeline.base.golden import GoldenRow, row_key
-from pipeline.base.tuned_on import EpisodePart, Side
+from pipeline.base.source import EpisodePart, GoldenRow, Side, row_key
 from pipeline.policy.document import FORMAT, PolicyDocument
 from pipeline.policy.normalization import Normalization
 from pipeline.policy.shape import PolicyShape

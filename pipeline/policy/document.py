@@ -10,9 +10,7 @@ from pydantic import Field, field_validator, model_validator
 
 from pipeline.base.border import Document, Text, shown
 from pipeline.base.config import TrainHeadParams
-from pipeline.base.golden import MOST_GOLDEN
-from pipeline.base.source import SourceDocument
-from pipeline.base.tuned_on import SIDES, EpisodePart, Side
+from pipeline.base.source import MOST_GOLDEN, SIDES, EpisodePart, Side, SourceDocument
 from pipeline.policy.normalization import Normalization
 from pipeline.policy.shape import MOST, PolicyShape
 

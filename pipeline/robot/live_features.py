@@ -17,7 +17,7 @@ from torch import Tensor
 from pipeline.base.commands import command
 from pipeline.base.config import TuningParams, VLMParams
 from pipeline.base.errors import CheckpointMismatch
-from pipeline.base.golden import row_key
+from pipeline.base.source import row_key
 from pipeline.policy.checkpoint import PolicyCheckpoint
 from pipeline.vlm.deviation import slot_deviations, tolerance_of
 from pipeline.vlm.feature_spec import live_differences

@@ -11,7 +11,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.base.table import Table
+from pipeline.base.text import Table
 from pipeline.robot.loop import StopKind
 
 TickPart = Literal["late", "observe", "check", "plan", "frames", "ask", "act", "record"]

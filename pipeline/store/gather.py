@@ -13,7 +13,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from pipeline.base.memory import available_bytes
+from pipeline.base.machine import available_bytes
 from pipeline.base.source import CLOCK_SLACK_S
 from pipeline.store.batch import Batch
 from pipeline.store.episodes import episode_of

@@ -18,10 +18,9 @@ from numcodecs import Zstd
 from numpy.typing import NDArray
 from zarr.codecs import BytesCodec, Crc32cCodec, ZstdCodec
 
-from pipeline.base.errors import StoreIncomplete
+from pipeline.base.errors import Issue, StoreIncomplete
 from pipeline.base.files import disk_full_named, sync
-from pipeline.base.golden import row_key
-from pipeline.base.issue import Issue
+from pipeline.base.source import row_key
 from pipeline.store.border import FrameDocument, StoreAttributes, StoredGolden, store_border
 from pipeline.store.chunks import read_rows
 from pipeline.store.metadata import check_metadata, note_metadata

@@ -23,8 +23,7 @@ from pipeline.base.commands import command
 from pipeline.base.digests import LEDGER_SUFFIX, is_ledger
 from pipeline.base.errors import ConfigError, PipelineError, StoreIncomplete, StoreLocked
 from pipeline.base.files import HELD, OutputKind, remove_folder
-from pipeline.base.format import size
-from pipeline.base.table import Table
+from pipeline.base.text import Table, size
 from pipeline.store.archive import ARCHIVE, is_archive, read_manifest
 from pipeline.store.border import StoreAttributes
 from pipeline.store.chunks import read_rows

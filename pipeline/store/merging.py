@@ -23,9 +23,13 @@ from tqdm import tqdm
 from pipeline.base.commands import command
 from pipeline.base.differences import describe, differences
 from pipeline.base.errors import ConfigError, StoreMismatch
-from pipeline.base.golden import spread
-from pipeline.base.source import RATE_TOLERANCE
-from pipeline.base.tuned_on import joined, of_store, store_attributes
+from pipeline.base.source import (
+    RATE_TOLERANCE,
+    join_tuned_on,
+    spread,
+    tuned_on_attributes,
+    tuned_on_of_store,
+)
 from pipeline.store.chunks import check_row_checksums, check_trailers, read_rows
 from pipeline.store.episodes import Episode, index_arrays
 from pipeline.store.golden import GOLDEN, GoldenFrames, read_golden
@@ -308,11 +312,11 @@ def _lay_out(build: StoreBuild, merged: MergedEpisodes, inodes: Sequence[Inode |
     for store, inode in zip(merged.stores, inodes, strict=True):
         refuse_replaced(store.path, inode)
     streams = {name: merged.having(name).streams[name] for name in ("sensor", "state")}
-    tuned = joined(of_store(store.attrs, store.path) for store in merged.stores)
+    tuned = join_tuned_on(tuned_on_of_store(store.attrs, store.path) for store in merged.stores)
     its_own = {"sources": merged.sources, "streams": first.streams | streams, "environment": []}
     attrs = {name: value for name, value in first.attrs.items() if name not in _NOT_TAKEN}
     of_vl = group_attributes(first.path / "vl")
-    build.finish_layout(attrs | its_own | store_attributes(tuned), of_vl)
+    build.finish_layout(attrs | its_own | tuned_on_attributes(tuned), of_vl)
 
 
 def _fill(build: StoreBuild, merged: MergedEpisodes) -> None:

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.base.arrays import widen
-from pipeline.base.golden import GoldenRow
+from pipeline.base.source import GoldenRow
 from pipeline.store.chunks import check_seal
 from pipeline.store.episodes import Episode, check_index, check_positions, episode_of, read_episodes
 from pipeline.store.golden import GoldenFrames, read_golden

@@ -22,10 +22,9 @@ from zarr.buffer import cpu
 from zarr.storage import MemoryStore
 
 from pipeline.base.arrays import non_finite
-from pipeline.base.errors import StoreIncomplete
+from pipeline.base.errors import Issue, StoreIncomplete
 from pipeline.base.files import REPLACED
-from pipeline.base.format import capped, size
-from pipeline.base.issue import Issue
+from pipeline.base.text import capped, size
 from pipeline.store.border import StoreAttributes, store_border
 from pipeline.store.chunks import (
     UNSEALED,

@@ -21,8 +21,8 @@ from torch import Tensor
 from tqdm import tqdm
 
 from pipeline.base.config import TrainHeadParams
-from pipeline.base.format import size
-from pipeline.base.memory import available_bytes
+from pipeline.base.machine import available_bytes
+from pipeline.base.text import size
 from pipeline.store import Batch, FeatureStore
 from pipeline.store.gather import WIDE, Index, Late, Selection, Window
 from pipeline.store.mapping import fitting

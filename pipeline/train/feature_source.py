@@ -6,7 +6,7 @@ from typing import Any
 
 import torch
 
-from pipeline.base.golden import GoldenRow
+from pipeline.base.source import GoldenRow
 from pipeline.policy.policy import Policy, Trainable
 from pipeline.store import FeatureStore
 from pipeline.train.batches import BatchIndices, DeviceStore, Prefetch, Windows

@@ -12,10 +12,10 @@ from torch import Tensor
 from tqdm import tqdm
 
 from pipeline.base.config import TrainHeadParams
-from pipeline.base.device import use_bfloat16
 from pipeline.base.errors import ConfigError, NumericsError
 from pipeline.base.files import sync
-from pipeline.base.format import duration, size
+from pipeline.base.machine import use_bfloat16
+from pipeline.base.text import duration, size
 from pipeline.policy.checkpoint import PolicyCheckpoint, save_policy
 from pipeline.policy.cost import describe_cost
 from pipeline.policy.observation import moving_channels

@@ -14,8 +14,8 @@ import torch
 import torch.distributed as dist
 from torch import Tensor, nn
 
-from pipeline.base.device import resolve_device
 from pipeline.base.errors import ConfigError, PipelineError
+from pipeline.base.machine import resolve_device
 
 Outcome = TypeVar("Outcome")
 

@@ -12,7 +12,7 @@ import torch
 from tqdm import tqdm
 
 from pipeline.base.config import TrainHeadParams
-from pipeline.base.format import duration
+from pipeline.base.text import duration
 from pipeline.policy.observation import PolicyShape
 from pipeline.store import FeatureStore
 from pipeline.train.batches import Prefetch

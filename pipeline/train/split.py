@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from pipeline.base.config import SplitParams
 from pipeline.base.errors import ConfigError, StoreMismatch
-from pipeline.base.tuned_on import SIDES, Side
+from pipeline.base.source import SIDES, Side
 from pipeline.store import Episode, FeatureStore, episode_name
 from pipeline.train.groups import episodes_by_group
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pipeline.base.commands import command
 from pipeline.base.differences import describe, differences
 from pipeline.base.errors import CheckpointMismatch, ConfigError
-from pipeline.base.tuned_on import SIDES, EpisodePart, Side, TunedPart, of_store
+from pipeline.base.source import SIDES, EpisodePart, Side, TunedPart, tuned_on_of_store
 from pipeline.policy.checkpoint import SOURCE_KEYS, PolicyCheckpoint
 from pipeline.store import Episode, FeatureStore, episode_name
 from pipeline.train.split import Split, ticks_of
@@ -125,7 +125,7 @@ def refuse_tuned_episodes(store: FeatureStore, split: Split) -> list[str]:
     Raises `ConfigError` where test has an episode that the model was tuned or chosen on, or val
     one that it was tuned on.
     """
-    tuned = of_store(store.attrs, store.path)
+    tuned = tuned_on_of_store(store.attrs, store.path)
     if tuned is None:
         if not store.spec.get("adapter"):
             return []

@@ -17,7 +17,7 @@ from pipeline.base.border import Border, Document
 from pipeline.base.commands import command
 from pipeline.base.config import VLMParams
 from pipeline.base.errors import VLMError
-from pipeline.base.tuned_on import TunedOn, joined, read_tuned_on
+from pipeline.base.source import TunedOn, join_tuned_on, read_tuned_on
 
 VLMS = Border(
     VLMError,
@@ -132,7 +132,7 @@ def tuned_on(vlm: VLMParams) -> TunedOn | None:
     folders = [resolve_checkpoint(vlm.checkpoint, vlm.revision)]
     if vlm.adapter:
         folders.append(resolve_checkpoint(vlm.adapter, setting="vlm.adapter"))
-    return joined(map(read_tuned_on, folders))
+    return join_tuned_on(map(read_tuned_on, folders))
 
 
 class _Text(Document):

@@ -13,11 +13,11 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from pipeline.base import golden
 from pipeline.base.commands import command
 from pipeline.base.config import VLMParams
 from pipeline.base.differences import describe, differences
 from pipeline.base.errors import VLMError
+from pipeline.base.source import Frames, row_key
 from pipeline.vlm.checkpoint_folder import (
     adapter_files,
     could_be_hub_id,
@@ -67,9 +67,9 @@ class FeatureSpec:
         """The document with its digest, as a store keeps it."""
         return {"digest": self.digest, **self.document}
 
-    def row_key(self, prompt: str, frames: golden.Frames) -> bytes:
+    def row_key(self, prompt: str, frames: Frames) -> bytes:
         """16 bytes that differ for every other spec, rendered prompt or decoded frames."""
-        return golden.row_key(self.digest, self.views, prompt, frames)
+        return row_key(self.digest, self.views, prompt, frames)
 
 
 def feature_spec(

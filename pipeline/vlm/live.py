@@ -10,9 +10,9 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from pipeline.base.config import TuningParams, VLMParams
-from pipeline.base.device import resolve_device
 from pipeline.base.digests import file_digest
 from pipeline.base.errors import CheckpointMismatch, VLMError
+from pipeline.base.machine import resolve_device
 from pipeline.vlm.extractor import Extractor, layers_needed
 from pipeline.vlm.feature_spec import FeatureSpec, feature_spec, live_differences
 from pipeline.vlm.loading import load_model

@@ -11,8 +11,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from pipeline.base.config import VLMParams
-from pipeline.base.device import resolve_device
 from pipeline.base.errors import NumericsError, VLMError
+from pipeline.base.machine import resolve_device
 from pipeline.vlm.extractor import Extractor, layers_needed
 from pipeline.vlm.feature_spec import FeatureSpec
 from pipeline.vlm.loading import environment, load_model

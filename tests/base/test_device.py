@@ -3,8 +3,8 @@
 import pytest
 import torch
 
-from pipeline.base.device import resolve_device, use_bfloat16
 from pipeline.base.errors import ConfigError
+from pipeline.base.machine import resolve_device, use_bfloat16
 
 CPU, CUDA = torch.device("cpu"), torch.device("cuda")
 

@@ -2,7 +2,7 @@
 
 import pytest
 
-from pipeline.base.format import as_yaml, duration, size
+from pipeline.base.text import as_yaml, duration, size
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.base.memory import available_bytes, memory_bytes
+from pipeline.base.machine import available_bytes, memory_bytes
 
 PAGE = mmap.PAGESIZE
 GIB = 2**30

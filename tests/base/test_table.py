@@ -4,7 +4,7 @@ import csv
 
 import pytest
 
-from pipeline.base.table import NOTHING, Table, number
+from pipeline.base.text import NOTHING, Table, number
 
 TABLE = Table(
     ("what", "count", "error", "right"),

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from pipeline.base.errors import ConfigError
-from pipeline.base.table import Table
+from pipeline.base.text import Table
 from pipeline.evaluate.baselines import BASELINES, METHODS
 from pipeline.evaluate.evaluation import JUDGED
 from pipeline.evaluate.experiments import (

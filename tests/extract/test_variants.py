@@ -8,7 +8,7 @@ import pytest
 
 from pipeline.base.config import Params
 from pipeline.base.errors import DiskFull
-from pipeline.base.format import size
+from pipeline.base.text import size
 from pipeline.extract import extract
 from pipeline.store import FeatureStore, StoreBuild
 from pipeline.store.schema import ARRAY_NAMES

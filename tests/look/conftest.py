@@ -10,8 +10,8 @@ import pytest
 from matplotlib.figure import Figure
 from playwright.sync_api import Browser, Page, Route
 
-from pipeline.base.issue import Issue
-from pipeline.base.table import Table
+from pipeline.base.errors import Issue
+from pipeline.base.text import Table
 from pipeline.look.page.blocks import (
     Issues,
     Outline,

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.base.table import Table
+from pipeline.base.text import Table
 from pipeline.evaluate.baselines import BASELINES
 from pipeline.evaluate.experiments import SPANS, Experiment, JudgedDocument
 from pipeline.look.comparison import comparison_report, draw_experiments

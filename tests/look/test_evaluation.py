@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from pipeline.base.config import EvaluateParams, TrainHeadParams
-from pipeline.base.table import Table
+from pipeline.base.text import Table
 from pipeline.evaluate.ablation import evaluate_ablation
 from pipeline.evaluate.baselines import Baselines
 from pipeline.evaluate.curves import TrainingCurve, TrainingCurves

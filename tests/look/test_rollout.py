@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.base.table import Table
+from pipeline.base.text import Table
 from pipeline.evaluate.rollouts import InsertionTrace, RolloutEpisode, Rollouts
 from pipeline.look.page.blocks import Outline, Picture, Report, Text
 from pipeline.look.page.writing import PAGE, write_report

@@ -21,7 +21,7 @@ from pipeline.base.files import (
     write_tensors,
     write_with_digest,
 )
-from pipeline.base.tuned_on import EpisodePart
+from pipeline.base.source import EpisodePart
 from pipeline.policy.checkpoint import (
     PolicyCheckpoint,
     check_policy,

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import zarr
 
-from pipeline.base.issue import Issue
+from pipeline.base.errors import Issue
 from pipeline.look.page.blocks import Issues, Report, Section
 from pipeline.look.page.style import RC
 from pipeline.robot.recorder import RunRecorder

@@ -168,7 +168,7 @@ class TestCheckpoint:
         assert proved == []
 
     def test_a_refusal(self, verified, proved, tmp_path, capsys, monkeypatch):
-        monkeypatch.setattr("pipeline.base.device.resolve_device", lambda name: "meta")
+        monkeypatch.setattr("pipeline.base.machine.resolve_device", lambda name: "meta")
         assert verified("--checkpoint", str(tmp_path / "head")) == 2
         assert capsys.readouterr().err.startswith("error: 2 of 2 golden rows are not")
 

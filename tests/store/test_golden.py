@@ -10,7 +10,7 @@ import pytest
 import zarr
 
 from pipeline.base.errors import StoreIncomplete
-from pipeline.base.golden import MOST_GOLDEN, row_key, spread
+from pipeline.base.source import MOST_GOLDEN, row_key, spread
 from pipeline.store import FeatureStore, StoreBuild, part_path
 from pipeline.store.archive import archive, restore
 from pipeline.store.golden import GOLDEN, GoldenFrames

@@ -17,7 +17,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from pipeline.base.errors import StoreIncomplete, StoreMismatch
-from pipeline.base.format import MOST_LINES, size
+from pipeline.base.text import MOST_LINES, size
 from pipeline.store import FeatureStore, check_trailers
 from pipeline.store.archive import archive
 from pipeline.store.chunks import write_seal

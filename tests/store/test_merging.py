@@ -13,7 +13,7 @@ import pytest
 import zarr
 
 from pipeline.base.errors import ConfigError, StoreIncomplete, StoreLocked, StoreMismatch
-from pipeline.base.tuned_on import TunedOn, TunedPart, of_store, store_attributes
+from pipeline.base.source import TunedOn, TunedPart, tuned_on_attributes, tuned_on_of_store
 from pipeline.extract.repair import begin_from_store
 from pipeline.store import FeatureStore, StoreBuild, build_lock, check_trailers
 from pipeline.store.chunks import write_seal
@@ -193,10 +193,12 @@ def test_what_the_model_was_tuned_on_is_that_of_both(tiny_store: Make, tmp_path:
     told = TunedOn(train=(parts[0],), val=(parts[1],)), TunedOn(train=(parts[0], parts[2]))
     paths = [tiny_store(tmp_path, name=name, seed=n) for n, name in enumerate(("one", "two"))]
     for path, tuned in zip(paths, told, strict=True):
-        zarr.open_group(path, mode="r+").attrs.update(store_attributes(tuned))
+        zarr.open_group(path, mode="r+").attrs.update(tuned_on_attributes(tuned))
         write_seal(path)
     merge(paths, tmp_path / "both.zarr")
-    merged = of_store(FeatureStore.open(tmp_path / "both.zarr").attrs, tmp_path / "both.zarr")
+    merged = tuned_on_of_store(
+        FeatureStore.open(tmp_path / "both.zarr").attrs, tmp_path / "both.zarr"
+    )
     assert merged == TunedOn(train=(parts[0], parts[2]), val=(parts[1],))
 
 

@@ -14,7 +14,7 @@ from pydantic import ValidationError
 
 from pipeline.base.config import SplitParams
 from pipeline.base.errors import ConfigError, StoreMismatch
-from pipeline.base.tuned_on import SIDES
+from pipeline.base.source import SIDES
 from pipeline.store import FeatureStore
 from pipeline.train.groups import episodes_by_group
 from pipeline.train.sampling import ticks_by_source

@@ -10,15 +10,15 @@ import zarr
 
 from pipeline.base.config import SplitParams
 from pipeline.base.errors import CheckpointIncomplete, ConfigError
-from pipeline.base.tuned_on import (
+from pipeline.base.source import (
     SIDES,
     TUNED_ON,
     TunedOn,
     TunedPart,
-    joined,
-    of_store,
+    join_tuned_on,
     read_tuned_on,
-    store_attributes,
+    tuned_on_attributes,
+    tuned_on_of_store,
     write_tuned_on,
 )
 from pipeline.store import FeatureStore
@@ -42,7 +42,7 @@ def tuned_store(tiny_store: Make, tmp_path: Path) -> Callable[..., FeatureStore]
         path = tiny_store(tmp_path, episodes=episodes)
         attrs: Any = zarr.open_group(path, mode="r+").attrs
         spec = attrs["feature_spec"] | {"adapter": "a digest"}
-        attrs.update({"feature_spec": spec, **store_attributes(tuned)})
+        attrs.update({"feature_spec": spec, **tuned_on_attributes(tuned)})
         write_seal(path)
         return FeatureStore.open(path)
 
@@ -103,9 +103,9 @@ def test_it_comes_back_and_damage_is_named(tmp_path: Path) -> None:
     tuned = TunedOn(train=(part(0), part(1, (3, 9))), val=(part(2),))
     write_tuned_on(tmp_path, tuned)
     assert read_tuned_on(tmp_path) == tuned
-    assert of_store(store_attributes(tuned), Path("a.zarr")) == tuned
-    assert store_attributes(of_store({}, Path("a.zarr"))) == {}
-    again = joined([None, tuned, TunedOn(train=(part(1, (3, 9)), part(4)))])
+    assert tuned_on_of_store(tuned_on_attributes(tuned), Path("a.zarr")) == tuned
+    assert tuned_on_attributes(tuned_on_of_store({}, Path("a.zarr"))) == {}
+    again = join_tuned_on([None, tuned, TunedOn(train=(part(1, (3, 9)), part(4)))])
     assert again == TunedOn(train=(part(0), part(1, (3, 9)), part(4)), val=(part(2),))
     (tmp_path / TUNED_ON).write_text('{"train": [{"episode": "a/b"}]}')
     with pytest.raises(CheckpointIncomplete, match=TUNED_ON):

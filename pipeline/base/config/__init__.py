@@ -2,17 +2,27 @@
 
 Every section is a frozen model that forbids unknown keys, so that a misspelt key is an error and
 not a default; all errors are reported at once. `stage_one` has the sections for the demo, the data,
-extraction and inspection, `stage_two` those for training, tuning and evaluation, `policy` those for
-the policy's parts, `stores` those for work on stores. `sections` has all of them and describes
-their keys; `limits` has the sections of a separate limits file; `load` reads files.
+extraction, inspection and stores, `training` those for training and tuning, `policy_use` those for
+what is done with a trained policy and a robot's limits. `params` has all of them, describes their
+keys and reads files.
 """
 # ruff: noqa: F401
 # pyright: reportUnusedImport=false
 
-from pipeline.base.config.limits import LimitsFile, MotionLimit
-from pipeline.base.config.load import load_params, load_section, setting
-from pipeline.base.config.policy import DiffusionParams, FlowMatchingParams, SensorEncoderParams
-from pipeline.base.config.sections import Params, described_keys
+from pipeline.base.config.params import Params, described_keys, load_params, load_section, setting
+from pipeline.base.config.policy_use import (
+    Chunking,
+    DriveParams,
+    EvaluateParams,
+    ExportParams,
+    Level,
+    LimitsFile,
+    MotionLimit,
+    RolloutAblation,
+    RolloutParams,
+    ServeParams,
+    latencies_ms,
+)
 from pipeline.base.config.stage_one import (
     AugmentationParams,
     DataParams,
@@ -20,24 +30,19 @@ from pipeline.base.config.stage_one import (
     InspectParams,
     MediaLimits,
     Pooling,
+    ProbeParams,
     Source,
+    StoresParams,
     VLMParams,
 )
-from pipeline.base.config.stage_two import (
-    Chunking,
-    DriveParams,
-    EvaluateParams,
-    ExportParams,
+from pipeline.base.config.training import (
+    DiffusionParams,
     FinetuneParams,
+    FlowMatchingParams,
     FusionStrategy,
-    Level,
     ModelType,
-    RolloutAblation,
-    RolloutParams,
-    ServeParams,
+    SensorEncoderParams,
     SplitParams,
     TrainHeadParams,
     TuningParams,
-    latencies_ms,
 )
-from pipeline.base.config.stores import ProbeParams, StoresParams

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from pipeline.base.files import write_document
-from pipeline.base.table import Table
+from pipeline.base.text import Table
 from pipeline.evaluate.figures import Figure, rounded
 from pipeline.evaluate.probe.study import ProbeResult, ProbeStudy, ranked, recommend
 

@@ -10,8 +10,7 @@ from pathlib import Path
 from packaging.requirements import Requirement
 
 from pipeline.base.config import Params
-from pipeline.base.errors import PipelineError
-from pipeline.base.issue import Issue
+from pipeline.base.errors import Issue, PipelineError
 
 WIDTH = 100
 _INDENT = 30

@@ -8,8 +8,7 @@ import numpy as np
 
 from pipeline.base.commands import command
 from pipeline.base.config import MediaLimits, Params, Source
-from pipeline.base.errors import RecordingError
-from pipeline.base.issue import Issue
+from pipeline.base.errors import Issue, RecordingError
 from pipeline.data import Opened, Recording, open_recordings
 from pipeline.data.media import DEFAULT_LIMITS, opened_video
 from pipeline.look.doctor import missing, note, ok

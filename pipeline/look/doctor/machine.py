@@ -11,11 +11,9 @@ import torch
 
 from pipeline.base.commands import command
 from pipeline.base.config import Params, VLMParams
-from pipeline.base.device import resolve_device
-from pipeline.base.errors import ConfigError, VLMError
-from pipeline.base.format import size
-from pipeline.base.issue import Issue
-from pipeline.base.memory import available_bytes, memory_bytes
+from pipeline.base.errors import ConfigError, Issue, VLMError
+from pipeline.base.machine import available_bytes, memory_bytes, resolve_device
+from pipeline.base.text import size
 from pipeline.look.doctor import missing, note, ok
 from pipeline.simulation.demo_recordings import MARKER
 from pipeline.vlm import checkpoint_folder

@@ -6,8 +6,8 @@ from typing import Any, Literal, TypeVar
 
 from matplotlib.figure import Figure
 
-from pipeline.base.issue import Issue
-from pipeline.base.table import Table
+from pipeline.base.errors import Issue
+from pipeline.base.text import Table
 
 
 @dataclass(frozen=True)

@@ -4,8 +4,8 @@ from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import replace
 
-from pipeline.base.issue import Issue, Severity
-from pipeline.base.table import Table
+from pipeline.base.errors import Issue, Severity
+from pipeline.base.text import Table
 
 FINDINGS = "findings.csv"
 

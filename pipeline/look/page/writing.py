@@ -23,7 +23,7 @@ from pipeline.base.files import (
     remove_folder,
     sync,
 )
-from pipeline.base.format import as_yaml
+from pipeline.base.text import as_yaml
 from pipeline.look.page.blocks import Block, Issues, Picture, Report, Section
 from pipeline.look.page.issues import FINDINGS, findings_csv, group_issues, place_of, places_of
 from pipeline.look.page.style import NO_FONT, RC, boxes, write

@@ -22,7 +22,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from pipeline.base.config import Params
-from pipeline.base.issue import Issue
+from pipeline.base.errors import Issue
 from pipeline.data import CameraStream
 from pipeline.data.timeline import last_at
 from pipeline.look.page.blocks import Block, Text

@@ -16,8 +16,8 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from pipeline.base.config import Params
-from pipeline.base.issue import Issue
-from pipeline.base.table import Table
+from pipeline.base.errors import Issue
+from pipeline.base.text import Table
 from pipeline.data.timeline import Timeline
 from pipeline.look.page.blocks import Block
 from pipeline.look.page.style import GRID, INK, PALETTE, panels

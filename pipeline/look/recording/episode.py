@@ -15,8 +15,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from pipeline.base.config import DataParams
-from pipeline.base.errors import RecordingError
-from pipeline.base.issue import Issue, Severity
+from pipeline.base.errors import Issue, RecordingError, Severity
 from pipeline.data import CameraStream, RecordedAction, Recording, Stream
 from pipeline.data.timeline import ActionRotation, Timeline, build_timeline
 from pipeline.look.page.blocks import Picture

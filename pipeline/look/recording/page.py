@@ -17,10 +17,8 @@ import numpy as np
 from tqdm import tqdm
 
 from pipeline.base.config import Params
-from pipeline.base.errors import RecordingError, StoreMismatch
-from pipeline.base.format import duration
-from pipeline.base.issue import Issue
-from pipeline.base.table import Table
+from pipeline.base.errors import Issue, RecordingError, StoreMismatch
+from pipeline.base.text import Table, duration
 from pipeline.data import Opened, Recording
 from pipeline.data.episode import Embodiment, common_embodiment
 from pipeline.data.recording import Nominal

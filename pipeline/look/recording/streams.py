@@ -13,8 +13,8 @@ from scipy.ndimage import median_filter
 
 from pipeline.base.channels import PROFILE_CHANNELS, hardly_moving, named, unnumbered
 from pipeline.base.config import Params
-from pipeline.base.issue import Issue
-from pipeline.base.table import Table
+from pipeline.base.errors import Issue
+from pipeline.base.text import Table
 from pipeline.data import Channels, Stream
 from pipeline.data.contact import CONTACT_RULE, contact_spans, force_columns
 from pipeline.data.timeline import last_at

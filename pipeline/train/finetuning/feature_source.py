@@ -12,8 +12,13 @@ from pipeline.base.config import FinetuneParams, Params, TrainHeadParams, settin
 from pipeline.base.digests import file_digest
 from pipeline.base.errors import ConfigError
 from pipeline.base.files import read_document, write_with_digest
-from pipeline.base.golden import GoldenRow
-from pipeline.base.tuned_on import TunedOn, joined, of_store, write_tuned_on
+from pipeline.base.source import (
+    GoldenRow,
+    TunedOn,
+    join_tuned_on,
+    tuned_on_of_store,
+    write_tuned_on,
+)
 from pipeline.policy.checkpoint import DOCUMENT
 from pipeline.policy.document import PolicyDocument
 from pipeline.policy.live_policy import LivePolicy
@@ -116,8 +121,9 @@ class ModelFeatureSource(FeatureSource):
         module.vlm.save(learned)
         path = folder / DOCUMENT
         document, content = read_document(path, PolicyDocument)
-        before, own = of_store(self.store.attrs, self.store.path), TunedOn.of_split(document.split)
-        write_tuned_on(learned, joined([before, own]) or own)
+        before = tuned_on_of_store(self.store.attrs, self.store.path)
+        own = TunedOn.of_split(document.split)
+        write_tuned_on(learned, join_tuned_on([before, own]) or own)
         write_with_digest(path, content | {"feature_spec": self._tuned_spec(folder).attrs()})
 
     def summary(self) -> list[str]:

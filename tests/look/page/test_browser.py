@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from pipeline.base.issue import Issue
+from pipeline.base.errors import Issue
 from pipeline.look.page.blocks import Issues, Report, Section, Text
 from pipeline.look.page.writing import write_report
 

@@ -9,8 +9,7 @@ import pytest
 from matplotlib.figure import Figure
 from PIL import Image
 
-from pipeline.base.errors import DiskFull
-from pipeline.base.issue import Issue
+from pipeline.base.errors import DiskFull, Issue
 from pipeline.look.page.blocks import Issues, Picture, Report, Section, Text
 from pipeline.look.page.issues import group_issues, place_of, places_of
 from pipeline.look.page.style import GRID, INK, canvas

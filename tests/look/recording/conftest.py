@@ -12,7 +12,7 @@ import pytest
 from matplotlib.figure import Figure
 
 from pipeline.base.config import DataParams, Source
-from pipeline.base.issue import Issue
+from pipeline.base.errors import Issue
 from pipeline.data import Channels, Stream, open_recordings
 from pipeline.data.timeline import choose_action_rotation
 from pipeline.look.page.style import RC

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from pipeline.base.config import Params
-from pipeline.base.table import Table
+from pipeline.base.text import Table
 from pipeline.data import Channels, Stream
 from pipeline.look.recording.episode import EpisodeView
 from pipeline.look.recording.streams import describe_channels, statistics_blocks

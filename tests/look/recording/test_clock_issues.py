@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from pipeline.base.issue import Issue
+from pipeline.base.errors import Issue
 from pipeline.look.recording.clocks import find_clock_issues
 from pipeline.look.recording.episode import EpisodeView
 

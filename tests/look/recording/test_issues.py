@@ -13,7 +13,7 @@ from PIL import Image
 
 from pipeline.base.channels import named
 from pipeline.base.config import DataParams, Source
-from pipeline.base.issue import Issue
+from pipeline.base.errors import Issue
 from pipeline.data import open_recordings
 from pipeline.look.recording.clocks import find_clock_issues
 from pipeline.look.recording.episode import EpisodeView, view_episode

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from pipeline.base.config import Params, Source
-from pipeline.base.issue import Issue
+from pipeline.base.errors import Issue
 from pipeline.data import open_recordings
 from pipeline.look.recording.page import RecordingsOverview, survey_recordings
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from pipeline.base.config import Params, load_params
-from pipeline.base.table import Table
+from pipeline.base.text import Table
 from pipeline.look.page.blocks import Issues, Picture, Report, Text, Tokens
 from pipeline.look.page.writing import write_report
 from pipeline.look.recording.page import recordings_report

@@ -8,7 +8,7 @@ import pytest
 
 from pipeline.base.config import VLMParams
 from pipeline.base.errors import RecordingError, VLMError
-from pipeline.base.table import Table
+from pipeline.base.text import Table
 from pipeline.look.page.blocks import Text, Tokens
 from pipeline.look.recording.episode import EpisodeView
 from pipeline.look.recording.samples import describe_stretch, fold_tokens, show_prompt

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.base.issue import Issue
+from pipeline.base.errors import Issue
 
 Change = Callable[[np.ndarray], np.ndarray]
 Found = Callable[..., tuple[Issue, ...]]

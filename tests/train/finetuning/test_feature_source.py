@@ -14,7 +14,7 @@ from torch import nn
 from pipeline.base.config import Params
 from pipeline.base.digests import file_digest
 from pipeline.base.errors import CheckpointMismatch, ConfigError
-from pipeline.base.tuned_on import of_store, read_tuned_on
+from pipeline.base.source import read_tuned_on, tuned_on_of_store
 from pipeline.extract import extract
 from pipeline.policy.checkpoint import find_policy, load_policy
 from pipeline.policy.live_policy import LivePolicy
@@ -98,8 +98,8 @@ def test_what_is_kept_is_the_averaged_model_that_was_judged(params: Make, tmp_pa
     # What it was tuned on goes along with the features, and is no part of what they are.
     tuned = read_tuned_on(output / "best" / "adapter")
     assert tuned is not None
-    assert of_store(store.attrs, store.path) == tuned
-    assert of_store(base.attrs, base.path) is None
+    assert tuned_on_of_store(store.attrs, store.path) == tuned
+    assert tuned_on_of_store(base.attrs, base.path) is None
     listed = load_policy(find_policy(output)).split
     for side in ("train", "val"):
         told = {part.episode: part.content for part in getattr(tuned, side)}

@@ -1,14 +1,18 @@
-"""The memory for this process: the machine's, or the limit of its container or job.
+"""The memory and the devices that a process may use.
 
-Limits are those of the process's control groups (version 2) and their parents.
+Limits of memory are those of the process's control groups (version 2) and their parents. torch is
+imported inside the functions: it takes over a second, which a command that has nothing to do must
+not spend.
 """
 
 from collections.abc import Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+from pipeline.base.commands import command
+from pipeline.base.errors import ConfigError
 
 _ROOT = Path("/")
-
-
 _FILE_PAGES = ("inactive_file", "active_file")
 """Lines of memory.stat for pages of files, which count as used but can be dropped."""
 
@@ -56,3 +60,43 @@ def _numbers(text: str) -> dict[str, int]:
 def _read(path: Path) -> str:
     """The text of a file; empty where there is no file."""
     return path.read_text(encoding="ascii").strip() if path.is_file() else ""
+
+
+if TYPE_CHECKING:
+    import torch
+
+
+def resolve_device(name: str) -> "torch.device":
+    """The device of a `device:` param; `auto` is the first CUDA device, or the CPU without one.
+
+    Raises `ConfigError` for a device that this machine or this build of torch does not have.
+    """
+    import torch
+
+    if name == "auto":
+        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    try:
+        device = torch.device(name)
+        if device.type not in ("cpu", "cuda"):
+            raise RuntimeError(f"{device.type} devices are not supported")
+        torch.empty(0, device=device)
+    except (RuntimeError, AssertionError) as error:
+        raise ConfigError(
+            f"device: {name}: expected auto, cpu or a device of this machine "
+            f"(CUDA devices found: {torch.cuda.device_count()}): {str(error).splitlines()[0]}. "
+            f"Set device to auto or cpu, or install what {command('doctor')} says"
+        ) from None
+    return device
+
+
+def use_bfloat16(amp: Literal["auto", "off", "bfloat16"], device: "torch.device") -> bool:
+    """Whether the forward pass runs under bfloat16 autocast.
+
+    `auto` means yes on a CUDA device with bfloat16 arithmetic. Elsewhere autocast is rarely faster,
+    and float32 keeps a run reproducible to the bit.
+    """
+    import torch
+
+    if amp == "auto":
+        return device.type == "cuda" and torch.cuda.is_bf16_supported(including_emulation=False)
+    return amp == "bfloat16"

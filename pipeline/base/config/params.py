@@ -1,19 +1,103 @@
-"""Read params.yaml and other YAML files of sections; the only module that reads YAML."""
+"""params.yaml as `Params`: all sections, the description of their keys, and reading the file."""
 
+import inspect
+import json
 import shlex
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from difflib import get_close_matches
 from itertools import islice
 from pathlib import Path
 from typing import Any, ClassVar, TypeVar, get_args
 
 import yaml
-from pydantic import BaseModel, ValidationError
+from pydantic import BaseModel, ValidationError, model_validator
+from pydantic.fields import FieldInfo
 
 from pipeline.base.border import Border, named, problems, shown
+from pipeline.base.config.policy_use import (
+    CompareParams,
+    DriveParams,
+    EvaluateParams,
+    ExportParams,
+    PushParams,
+    RolloutParams,
+    ServeParams,
+)
 from pipeline.base.config.section import Section
-from pipeline.base.config.sections import Params
+from pipeline.base.config.stage_one import (
+    ArchiveParams,
+    DataParams,
+    DemoParams,
+    ExtractParams,
+    InspectParams,
+    ProbeParams,
+    StoresParams,
+    VerifyParams,
+    VLMParams,
+)
+from pipeline.base.config.training import FinetuneParams, TrainHeadParams
 from pipeline.base.errors import ConfigError
+
+
+class Params(Section):
+    """All of params.yaml."""
+
+    demo: DemoParams = DemoParams()
+    data: DataParams
+    vlm: VLMParams
+    extract: ExtractParams = ExtractParams()
+    train_head: TrainHeadParams = TrainHeadParams()
+    evaluate: EvaluateParams = EvaluateParams()
+    rollout: RolloutParams = RolloutParams()
+    serve: ServeParams = ServeParams()
+    drive: DriveParams = DriveParams()
+    export: ExportParams = ExportParams()
+    finetune: FinetuneParams = FinetuneParams()
+    compare: CompareParams = CompareParams()
+    verify: VerifyParams = VerifyParams()
+    archive: ArchiveParams = ArchiveParams()
+    probe: ProbeParams = ProbeParams()
+    stores: StoresParams = StoresParams()
+    push: PushParams = PushParams()
+    inspect: InspectParams = InspectParams()
+
+    @model_validator(mode="after")
+    def _mixture_names_sources(self) -> "Params":
+        names = [source.name for source in self.data.sources]
+        unknown = sorted(set(self.train_head.mixture) - set(names))
+        if unknown and self.train_head.store is None:
+            mixture, there = ", ".join(unknown), ", ".join(names)
+            raise ValueError(f"train_head.mixture names {mixture}, but data.sources has {there}")
+        return self
+
+
+def described_keys(sections: Sequence[str]) -> list[str]:
+    """Every key of these sections: a line with its default, then its meaning."""
+    lines: list[str] = []
+    for name in sections:
+        section = Params.model_fields[name].annotation
+        assert isinstance(section, type) and issubclass(section, Section), name
+        lines += [f"{name}: {inspect.getdoc(section)}", *_lines(section, name), ""]
+    return lines[:-1]
+
+
+def _lines(section: type[Section], place: str) -> Iterator[str]:
+    for name, field in section.model_fields.items():
+        inner = field.annotation
+        if isinstance(inner, type) and issubclass(inner, Section):
+            yield from _lines(inner, f"{place}.{name}")
+            continue
+        yield f"  {place}.{name} = {_default(field)}"
+        for line in (field.description or "").splitlines():
+            yield f"      {line.strip()}"
+
+
+def _default(field: FieldInfo) -> str:
+    if field.is_required():
+        return "(has to be given)"
+    value: Any = field.get_default(call_default_factory=True, validated_data={})
+    return json.dumps(value, default=str)
+
 
 _Section = TypeVar("_Section", bound=Section)
 

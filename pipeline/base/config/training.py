@@ -1,34 +1,118 @@
-"""Sections for training, tuning of the vision-language model itself, and evaluation."""
+"""Sections for training a policy, its parts, and tuning of the vision-language model itself."""
 
 import math
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from pydantic import Field, field_validator, model_validator
 
-from pipeline.base.config.policy import (
-    DiffusionParams,
-    ExpertParams,
-    FlowMatchingParams,
-    RegressionParams,
-    SensorEncoderParams,
-    StateEncoderParams,
-)
 from pipeline.base.config.section import Fraction, Output, Place, Section, Seed
 
 ModelType = Literal["regression", "diffusion", "flow_matching"]
 FusionStrategy = Literal["concat", "cross_attention", "gated", "none"]
-Level = Literal["depth", "full", "moved"]
-Chunking = Literal["none", "temporal", "rtc"]
-RolloutAblation = Literal[
-    "sensor off", "features off", "state off", "sensor frozen", "features frozen", "state frozen"
-]
-ExportFormat = Literal["onnx", "torch"]
 LoggerName = Literal["tensorboard", "wandb"]
 Weight = Annotated[float, Field(ge=0, le=1e6)]
-Latency = Annotated[float, Field(ge=0, le=60_000)]
 Share = Annotated[float, Field(ge=0, lt=1)]
+
+
+class SensorEncoderParams(Section):
+    """Sizes of the sensor encoder; its parameters and cost are printed when training begins."""
+
+    kind: Literal["joint", "force_aware"] = "joint"
+    """joint: one branch for all channels. force_aware: force has its own and is not lost."""
+    channels: tuple[Annotated[int, Field(ge=1, le=8192)], ...] = Field(
+        default=(64, 128, 128, 128), min_length=1, max_length=16
+    )
+    """Width of each residual convolution block; every block halves the length."""
+    layers: int = Field(default=1, ge=0, le=128)
+    """Transformer layers after the convolutions."""
+    heads: int = Field(default=4, ge=1, le=256)
+    """Attention heads; must divide the last of `channels`."""
+    output_dim: int = Field(default=128, ge=1, le=8192)
+    """Width of the encoded window."""
+
+
+class StateEncoderParams(Section):
+    """Sizes of the robot-state encoder."""
+
+    dim: int = Field(default=64, ge=1, le=8192)
+    """Width of its transformer."""
+    layers: int = Field(default=1, ge=0, le=128)
+    """Transformer layers."""
+    heads: int = Field(default=4, ge=1, le=256)
+    """Must divide `dim`."""
+    output_dim: int = Field(default=64, ge=1, le=8192)
+    """Width of the encoded window."""
+    patch: int = Field(default=10, ge=1, le=10_000)
+    """Readings per token."""
+
+
+class ExpertParams(Section):
+    """Sizes of the action expert, of any kind."""
+
+    dim: int = Field(default=128, ge=1, le=8192)
+    """Width of its transformer and of its context."""
+    layers: int = Field(default=2, ge=1, le=128)
+    """Transformer layers."""
+    heads: int = Field(default=4, ge=1, le=256)
+    """Must divide `dim`."""
+    dropout: Annotated[float, Field(ge=0, lt=1)] = 0.1
+    """Dropout during training."""
+
+
+class RegressionParams(Section):
+    """Params of the regression expert only."""
+
+    refinements: int = Field(default=1, ge=1, le=100)
+    """Rounds of prediction; the first starts from zeros, each later one from the round before."""
+
+
+class DiffusionParams(Section):
+    """Params of the diffusion expert only."""
+
+    draws: int = Field(default=3, ge=1, le=1000)
+    """Draws of noise and schedule step per chunk in a training step. The context, which costs most,
+    is computed once for all of them."""
+    timesteps: int = Field(default=100, ge=2, le=10_000)
+    """Steps of the noise schedule."""
+    schedule: Literal["cosine", "linear"] = "cosine"
+    """How the noise grows over the steps."""
+    prediction: Literal["epsilon", "sample", "v"] = "sample"
+    """What the network predicts: the noise, the clean chunk, or the velocity between them."""
+    sampler: Literal["ddpm", "ddim"] = "ddim"
+    """`ddpm` takes every step of the schedule, `ddim` takes `sampling_steps`."""
+    sampling_steps: int = Field(default=4, ge=1, le=10_000)
+    """Steps of `ddim`; at most `timesteps`."""
+    eta: float = Field(default=0.0, ge=0, le=1)
+    """Randomness of `ddim`: 0 is deterministic after the first noise, 1 is as random as `ddpm`."""
+    clip: float | None = Field(default=5.0, gt=0, le=1e6)
+    """The clean chunk is clipped to this many standard deviations in every sampling step."""
+
+    @model_validator(mode="after")
+    def _steps_are_of_the_schedule(self) -> "DiffusionParams":
+        if self.sampler == "ddim" and self.sampling_steps > self.timesteps:
+            raise ValueError(
+                f"sampling_steps {self.sampling_steps} is above timesteps {self.timesteps}"
+            )
+        return self
+
+
+class FlowMatchingParams(Section):
+    """Params of the flow-matching expert only."""
+
+    draws: int = Field(default=3, ge=1, le=1000)
+    """Draws of noise and time per chunk in a training step, as in `diffusion.draws`."""
+    sampling_steps: int = Field(default=4, ge=1, le=10_000)
+    """Steps of the ODE solver."""
+    solver: Literal["euler", "midpoint", "rk4"] = "euler"
+    """ODE solver: one, two or four evaluations of the network per step."""
+    time: Literal["uniform", "beta"] = "beta"
+    """Distribution of the times in training."""
+    alpha: float = Field(default=1.5, gt=0, le=1e3)
+    """First parameter of the beta distribution of the noise's share 1 - t: larger than `beta` draws
+    noisy times more often (Black et al. 2024)."""
+    beta: float = Field(default=1.0, gt=0, le=1e3)
+    """Second parameter of that beta distribution."""
 
 
 class SplitParams(Section):
@@ -240,185 +324,6 @@ class TrainHeadParams(Section):
         if self.state_window_s is None or self.state_reach_s is None:
             return self.state_window
         return math.ceil(self.state_window * self.state_reach_s / self.state_window_s)
-
-
-class EvaluateParams(Section):
-    """Which policy is evaluated, and where the report is written."""
-
-    checkpoint: Place | None = None
-    """A training run's folder, or one checkpoint in it; null: `train_head.output`. DVC does not
-    watch another one."""
-    output: Output = Path("reports/evaluate")
-    """Folder of metrics, tables and pictures."""
-    batch_size: int = Field(default=64, ge=1, le=2**16)
-    """Ticks per forward pass."""
-    samples: int = Field(default=16, ge=1, le=1000)
-    """Chunks sampled per tick. The error is that of one chunk, averaged over them for less noise;
-    the error of their mean, that of the best one and the energy score are reported beside it.
-    Experts that do not sample give one."""
-    execute: int = Field(default=1, ge=1, le=1000)
-    """Steps of a chunk that the robot executes before it requests the next; their error comes
-    first."""
-    modalities: bool = True
-    """Also evaluate with each stream zeroed, shuffled across episodes and delayed."""
-    device: str = "auto"
-    """auto, cpu, cuda or cuda:N."""
-    store: Place | None = None
-    """The store to evaluate on; null: `train_head.store`, or else `extract.store`."""
-    check_store: bool = True
-    """Read the whole store once before the evaluation, and refuse a chunk that does not give its
-    checksum; false skips this, where it takes too long."""
-
-
-def latencies_ms(given: float | Sequence[float]) -> tuple[float, ...]:
-    """Each latency of `rollout.latency_ms` once, in the given order."""
-    return tuple(dict.fromkeys(given if isinstance(given, Sequence) else (given,)))
-
-
-class RolloutParams(Section):
-    """How a policy runs in closed loop in the simulation, and where the report is written."""
-
-    checkpoint: Place | None = None
-    """A training run's folder, or one checkpoint in it; `train_head.output` where null."""
-    environment: Literal["phantom"] | None = "phantom"
-    """The simulated needle insertion of the demo. null runs no rollout, for recordings of another
-    robot; the stage then only says so."""
-    level: Level = "full"
-    """depth: the needle begins above the target, so that the sensor is enough. full: it begins
-    anywhere. moved: like full, and target and tissue are pushed during the insertion."""
-    episodes: int = Field(default=50, ge=1, le=1_000_000)
-    """Episodes per controller."""
-    seed: int = Field(default=1_000_000, ge=0, lt=2**53)
-    """Seed of the first episode; later episodes have the next seeds."""
-    execute: int = Field(default=1, ge=1, le=1000)
-    """Steps of a chunk that are executed before the head computes the next."""
-    chunking: Chunking = "temporal"
-    """none: the newest chunk. temporal: the weighted mean of all chunks that reach the tick
-    (temporal ensembling). rtc: each chunk is drawn to continue the last (real-time chunking), for
-    experts that sample."""
-    latency_ms: Latency | Annotated[tuple[Latency, ...], Field(min_length=1)] = 0.0
-    """Simulated time in ms of one pass of the model; its features are older by this. The head takes
-    no time. For several, such as `[0, 300, 600]`, the page plots success against latency;
-    everything else uses the first."""
-    head: Place | None = None
-    """Folder of `stages.export`; its head.onnx replaces the checkpoint's own head."""
-    ablations: tuple[RolloutAblation, ...] = ("sensor off", "features off")
-    """Also run the policy with one stream disturbed. off: every value is its training mean. frozen:
-    the stream stays as it was first, as if it were new. Streams that the policy does not use are
-    skipped, and so is `off` for its only stream. []: none."""
-    server: str | None = None
-    """Address of a running `stages.serve`, such as ws://127.0.0.1:8000; its policy is run over the
-    network in place of `checkpoint`. If it needs a token, set the environment variable
-    VLA_SERVE_TOKEN."""
-    device: str = "auto"
-    """auto, cpu, cuda or cuda:N."""
-    output: Output = Path("reports/rollout")
-    """Folder of metrics, table and page."""
-
-    @model_validator(mode="after")
-    def _one_answers(self) -> "RolloutParams":
-        if self.head is not None and self.server is not None:
-            raise ValueError("head and server: either an exported head answers or a server does")
-        if self.head is not None and self.chunking == "rtc":
-            raise ValueError("head: an exported head cannot be guided: set chunking to temporal")
-        return self
-
-
-class ServeParams(Section):
-    """How a policy is served to robots."""
-
-    checkpoint: Place | None = None
-    """A training run's folder, or one checkpoint in it; `train_head.output` where null."""
-    host: str = "127.0.0.1"
-    """Address to listen on. All but this machine's own (127.0.0.1, ::1) need a token."""
-    port: int = Field(default=8000, ge=0, le=65535)
-    """Port to listen on; 0 chooses a free one and prints it."""
-    token_file: Place | None = None
-    """File with the token that robots must send. null: the environment variable VLA_SERVE_TOKEN, or
-    no token if that is not set."""
-    fresh: bool = True
-    """A chunk waits for the features of the frames in its observation. false: it uses the newest
-    available features, and the model computes new ones meanwhile."""
-    device: str = "auto"
-    """auto, cpu, cuda or cuda:N."""
-    seed: Seed = 0
-    """Seed of a policy's draws for a robot that sends no seed."""
-    max_connections: int = Field(default=8, ge=1, le=10_000)
-    """Most robots at a time."""
-    max_waiting: int = Field(default=8, ge=1, le=10_000)
-    """Most observations that are being answered or wait; one more is refused as busy."""
-    max_message_mb: int = Field(default=64, ge=1, le=1024)
-    """Largest size of one observation, in MiB."""
-    idle_s: float = Field(default=600.0, gt=0, le=1e6)
-    """Seconds after which a connection without a complete message is closed."""
-    transform: Literal["aloha", "droid", "libero"] | None = None
-    """Take observations by the names that openpi's clients of this robot give. Their images are
-    the policy's views in this order. aloha: `images/cam_high`, `cam_left_wrist`,
-    `cam_right_wrist`, `cam_low`; `state`. droid: `observation/exterior_image_1_left`,
-    `wrist_image_left`; the state is `joint_position` and `gripper_position`. libero:
-    `observation/image`, `wrist_image`; `observation/state`."""
-    log: Literal["text", "json"] = "text"
-    """How the line of each connection, episode, slow answer, warning and refusal is written."""
-
-
-class DriveParams(Section):
-    """Which robot is driven, by which policy, and what ends the run."""
-
-    robot: str = "pipeline.simulation.realtime:SimulatedRobot"
-    """`module:Class` of a class with `observe`, `frames`, `act` and `stop`, or with LeRobot's
-    interface; or `lerobot:TYPE`, an arm of an installed LeRobot, such as `lerobot:so101_follower`.
-    """
-    robot_args: dict[str, Any] = Field(default_factory=dict)
-    """The arguments of the class, or the config of LeRobot's arm (`port`, `cameras`, …)."""
-    cameras: dict[str, str] = Field(default_factory=dict)
-    """Cameras of a LeRobot arm by the policy's view; a view has the camera of its own name."""
-    motors: dict[str, str] = Field(default_factory=dict)
-    """Motors of a LeRobot arm by the policy's channel; a channel has the motor of its own name."""
-    camera_latency_s: float = Field(default=0.0, ge=0, le=10)
-    """How long an image of a LeRobot arm is on its way, for LeRobot gives no times."""
-    server: str | None = None
-    """Address of a running stages.serve, such as ws://192.168.1.5:8000. null: the policy runs in
-    this process. A token is taken from the environment variable VLA_SERVE_TOKEN."""
-    timeout_s: float = Field(default=10.0, gt=0, le=600)
-    """How long the server may take to connect, and to answer."""
-    checkpoint: Place | None = None
-    """Without a server: a training run's folder, or a checkpoint; `train_head.output` where null.
-    """
-    device: str = "auto"
-    """Without a server: auto, cpu, cuda or cuda:N."""
-    instruction: str | None = None
-    """What the robot is to do. null: the only instruction that the policy was trained on."""
-    limits: Place | None = None
-    """YAML file with the limits of motion, workspace and force. null: nothing is limited."""
-    runs: Output | None = Path("runs")
-    """Each run becomes a LeRobot data set `run_NNNNNN` in this folder. null: nothing is recorded.
-    """
-    seconds: float | None = Field(default=None, gt=0, le=1e6)
-    """How long the robot is driven. null: until something ends the run."""
-    settings: dict[str, Any] = Field(default_factory=dict)
-    """Other fields of `RunSettings` (`pipeline.robot.realtime`), such as `old_features_s`."""
-
-
-class ExportParams(Section):
-    """Which policy's head is exported for other runtimes, and in which formats."""
-
-    checkpoint: Place | None = None
-    """A training run's folder, or one checkpoint in it; `train_head.output` where null."""
-    output: Output = Path("models/export")
-    """Folder of the files and their receipt."""
-    formats: tuple[ExportFormat, ...] = Field(default=("onnx", "torch"), min_length=1)
-    """onnx: `head.onnx`, for ONNX Runtime. torch: `head.pt2`, for `torch.export.load`."""
-    opset: int = Field(default=20, ge=18, le=100)
-    """ONNX operator set version."""
-
-
-class CompareParams(Section):
-    """Which evaluations are compared in one table."""
-
-    reports: Place = Path("reports/experiments")
-    """Folder of evaluation folders, each named after its experiment."""
-    output: Output = Path("reports/comparison")
-    """Folder of the table and the picture."""
 
 
 class TuningParams(Section):
