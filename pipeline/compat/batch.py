@@ -9,7 +9,7 @@ from jaxtyping import Float64, Int64, UInt8
 from torch import Tensor
 
 from pipeline.base.errors import StoreMismatch
-from pipeline.data.row_range import Frames
+from pipeline.data.episode import Frames
 from pipeline.store import Batch
 
 Sample = Mapping[str, Any]

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from pipeline.base.border import shown
 from pipeline.base.config import MediaLimits
 from pipeline.base.errors import RecordingError
-from pipeline.data.media import DEFAULT_LIMITS, INTACT, RECORDINGS, check_unpacked
+from pipeline.data.recording import DEFAULT_LIMITS, INTACT, RECORDINGS, check_unpacked
 
 Numbers = NDArray[Any]
 """An array of real numbers of any width."""

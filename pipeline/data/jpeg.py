@@ -4,21 +4,31 @@ import math
 import os
 import re
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from filecmp import cmp
+from io import BytesIO
 from itertools import pairwise
 from pathlib import Path, PurePath
 from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
+from PIL import Image, UnidentifiedImageError
 
 from pipeline.base.border import shown
 from pipeline.base.config import MediaLimits
 from pipeline.base.errors import RecordingError
-from pipeline.data.media import DEFAULT_LIMITS, FARTHEST_S, check_image_file, in_rgb, opened_image
-from pipeline.data.recording import CameraStream, entries, natural_key
+from pipeline.data.recording import (
+    DEFAULT_LIMITS,
+    FARTHEST_S,
+    INTACT,
+    RECORDINGS,
+    CameraStream,
+    check_limit,
+    entries,
+    natural_key,
+)
 
 THUMBNAIL = (32, 18)
 """Width and height of the thumbnail of a checked JPEG."""
@@ -33,6 +43,17 @@ _PADDED = re.compile(r"0\d+")
 _COUNTS = 1e6
 """Whole numbers below it count frames; a clock in whole seconds since 1970 is above 1e9."""
 _VIEW = re.compile(r"view(?=\d)", re.IGNORECASE)
+_FORMATS = ("JPEG", "PNG")
+_AS_RGB = ("1", "L", "LA", "P", "PA", "RGB", "RGBA", "CMYK")
+"""Modes of images that are converted to RGB; transparent pixels become opaque."""
+_SIXTEEN_BITS = ("I;16", "I;16B", "I;16L", "I;16N")
+"""Modes of grey images of 16 bits; the upper eight bits are kept."""
+_IMAGE_BYTES = 16 * 2**20
+"""Bytes that an image file may have above one per pixel of the limits; a JPEG has about half."""
+_SCAN, _MOST_SCANS = b"\xff\xda", 100
+"""A progressive JPEG has about ten scans; each goes over all pixels again."""
+
+Image.MAX_IMAGE_PIXELS = None  # The header is compared with the source's limits instead.
 
 
 class JpegCamera(CameraStream):
@@ -173,8 +194,12 @@ def read_image(
     file: Path | bytes, where: str, limits: MediaLimits = DEFAULT_LIMITS
 ) -> NDArray[np.uint8]:
     """The image (height, width, 3), RGB as stored (EXIF orientation is ignored)."""
-    with opened_image(file, where, limits) as image:
-        return in_rgb(image)
+    with _opened_image(file, where, limits) as image:
+        if image.mode in _SIXTEEN_BITS:
+            upper = (np.asarray(image) >> 8).astype(np.uint8)
+            return np.repeat(upper[:, :, None], 3, axis=2)
+        image.info.pop("transparency", None)  # Pillow would warn about a palette's transparency
+        return np.asarray(image.convert("RGB"))
 
 
 def check_image(
@@ -185,12 +210,48 @@ def check_image(
     A JPEG is decoded at an eighth of its size; some of its pixels, evenly spread, are returned as a
     `THUMBNAIL`. A PNG is checked by its checksums and returns None.
     """
-    with opened_image(file, where, limits) as image:
+    with _opened_image(file, where, limits) as image:
         if image.format == "PNG":
             image.verify()
             return None
         image.draft("RGB", (max(1, image.width // 8), max(1, image.height // 8)))
         return np.asarray(image.resize(THUMBNAIL, Image.Resampling.NEAREST).convert("RGB"))
+
+
+@contextmanager
+def _opened_image(
+    file: Path | bytes, where: str, limits: MediaLimits
+) -> Generator[Image.Image, None, None]:
+    """An open JPEG or PNG; an error inside becomes a `RecordingError` that begins with `where`.
+
+    Its header says that its pixels are within the limits; nothing is decoded yet.
+    """
+    unreadable = "cannot be decoded as an image"
+    with RECORDINGS.foreign(where, unreadable):
+        if isinstance(file, Path):
+            check_image_file(file, limits)
+            file = file.read_bytes()
+        try:
+            image = Image.open(BytesIO(file), formats=_FORMATS)
+        except UnidentifiedImageError:
+            why = f"{unreadable}: expected a JPEG or PNG, found {shown(file[:16])}"
+            raise RECORDINGS.refusal(where, why) from None
+        with image:
+            check_limit(where, image.width * image.height, limits.pixels, "pixels", "pixels")
+            if image.mode not in _AS_RGB + _SIXTEEN_BITS:
+                why = f"expected pixels of 8 bits, or grey ones of 16, found mode {image.mode!r}"
+                raise INTACT.refusal(where, why)
+            if image.format == "JPEG" and (scans := file.count(_SCAN)) > _MOST_SCANS:
+                why = f"expected at most {_MOST_SCANS} scans over the image, found {scans:,}"
+                raise INTACT.refusal(where, why)
+            yield image
+
+
+def check_image_file(file: Path, limits: MediaLimits) -> int:
+    """The size of a regular file; refused if no image within the limits needs so many bytes."""
+    size = RECORDINGS.check_file(file)
+    check_limit(file, size, _IMAGE_BYTES + limits.pixels, "pixels", "bytes")
+    return size
 
 
 def _view_folders(folder: Path, prefix: str) -> list[Path]:

@@ -20,9 +20,8 @@ from pipeline.base.border import Border, Document, Text, shown
 from pipeline.base.config import MediaLimits
 from pipeline.base.errors import RecordingError
 from pipeline.base.source import is_view_name
-from pipeline.data.media import Grouped
-from pipeline.data.parquet import ParquetTable
-from pipeline.data.recording import ActionKind, natural_key
+from pipeline.data.lerobot_rows import ParquetTable
+from pipeline.data.recording import ActionKind, Grouped, natural_key
 from pipeline.data.video import VideoSpan, frame_count
 
 T = TypeVar("T")

@@ -28,8 +28,17 @@ from pipeline.data.insertion import (
     robot_state_file,
 )
 from pipeline.data.jpeg import list_empty_views, list_views, split_eye
-from pipeline.data.media import RECORDINGS, Grouped, Rate, Seconds
-from pipeline.data.recording import Nominal, Stream, check_clock, check_resolution, checked_stream
+from pipeline.data.recording import (
+    RECORDINGS,
+    Grouped,
+    Nominal,
+    Rate,
+    Seconds,
+    Stream,
+    check_clock,
+    check_resolution,
+    checked_stream,
+)
 
 MARKER = "metadata.json"
 _SENSOR_FILE = "sensor_data.npz"

@@ -167,7 +167,7 @@ def test_pixels_of_a_png_are_shown_in_eight_bits(tmp_path, mode):
 
 def test_a_mode_that_cannot_be_shown_is_refused_by_name(tmp_path, monkeypatch):
     Image.fromarray(np.zeros((4, 6), np.uint8)).save(path := tmp_path / "1.0.png")
-    monkeypatch.setattr("pipeline.data.media._AS_RGB", ("RGB",))
+    monkeypatch.setattr("pipeline.data.jpeg._AS_RGB", ("RGB",))
     for look in (check_image, read_image):
         with pytest.raises(RecordingError, match="found mode 'L'"):
             look(path, str(path))

@@ -15,12 +15,12 @@ import av
 import numpy as np
 import pytest
 from PIL import Image
+from pipeline.data.media import check_unpacked, opened_video
 
 from pipeline.base.config import MediaLimits
 from pipeline.base.errors import RecordingError
 from pipeline.data.arrays import read_csv, read_npy, read_npz
 from pipeline.data.jpeg import JpegCamera, check_image, read_image
-from pipeline.data.media import check_unpacked, opened_video
 from pipeline.data.recording import content_digest
 
 MEND = "Copy the file again, or leave the episode out"

@@ -14,9 +14,9 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from pipeline.data.plain_pickle import load_plain as load
 
 from pipeline.base.errors import RecordingError
-from pipeline.data.plain_pickle import load_plain as load
 
 
 def load_plain(path: Path) -> object:

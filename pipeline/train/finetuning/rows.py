@@ -16,7 +16,7 @@ import torch
 from numpy.typing import NDArray
 
 from pipeline.data import Recording
-from pipeline.data.row_range import RowFrames, by_episode
+from pipeline.data.episode import RowFrames, by_episode
 from pipeline.policy.observation import LiveObservation
 from pipeline.store import Batch, FeatureStore
 from pipeline.train.batches import BatchIndices, Prefetch, Windows
