@@ -4,7 +4,7 @@ import math
 import os
 import re
 from collections import Counter, defaultdict
-from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from filecmp import cmp
 from io import BytesIO
@@ -34,7 +34,6 @@ THUMBNAIL = (32, 18)
 """Width and height of the thumbnail of a checked JPEG."""
 
 Frame = TypeVar("Frame")
-Seen = TypeVar("Seen")
 _EYES = ("left", "right")
 _SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".gif", ".tif", ".tiff", ".webp")
 """Suffixes of images; those that cannot be decoded are refused with their name."""
@@ -76,15 +75,17 @@ class JpegCamera(CameraStream):
         self._limits = limits
 
     def check(self, indices: Sequence[int]) -> NDArray[np.uint8] | None:
-        seen = [self._each(check_image, index) for index in indices]
-        decoded = [thumbnail for thumbnail in seen if thumbnail is not None]
-        return np.stack(decoded) if seen and len(decoded) == len(seen) else None
+        files = [self.paths[index] for index in indices]
+        checked = [check_image(file, str(file), self._limits) for file in files]
+        thumbnails = [thumbnail for thumbnail in checked if thumbnail is not None]
+        return np.stack(thumbnails) if files and len(thumbnails) == len(files) else None
 
     def read(self, indices: Sequence[int]) -> Iterator[NDArray[np.uint8]]:
         last, frame = -1, None
         for index in indices:
             if frame is None or index != last:
-                last, frame = index, self._each(read_image, index)
+                file = self.paths[index]
+                last, frame = index, read_image(file, str(file), self._limits)
             yield frame
 
     def repeats(self) -> NDArray[np.bool_]:
@@ -94,9 +95,6 @@ class JpegCamera(CameraStream):
         for place in np.flatnonzero(same):
             same[place] = cmp(self.paths[place], self.paths[place + 1], shallow=False)
         return same
-
-    def _each(self, ask: Callable[[Path, str, MediaLimits], Seen], index: int) -> Seen:
-        return ask(self.paths[index], str(self.paths[index]), self._limits)
 
 
 def frame_time(path: PurePath) -> float:
@@ -120,10 +118,10 @@ def _check_not_counted(timed: Sequence[tuple[float, str]]) -> None:
         raise _no_time(Path(timed[-1][1]), f"frames counted from {first:g} to {last:g}")
 
 
-def _no_time(path: PurePath, found: str) -> RecordingError:
+def _no_time(path: PurePath, name: str) -> RecordingError:
     return RecordingError(
         f"{path}: expected a name that ends in the time in seconds, such as "
-        f"zed_left_1761551500.174.jpg, found {found}. Rename the frames by their times"
+        f"zed_left_1761551500.174.jpg, found {name}. Rename the frames by their times"
     )
 
 
@@ -255,14 +253,17 @@ def check_image_file(file: Path, limits: MediaLimits) -> int:
 
 
 def _view_folders(folder: Path, prefix: str) -> list[Path]:
-    there = [e for e in _entries(folder) if split_eye(e.name)[0].startswith(prefix) and e.is_dir()]
-    views = sorted((Path(entry.path) for entry in there), key=lambda view: natural_key(view.name))
+    views = [
+        Path(entry.path)
+        for entry in _entries(folder)
+        if split_eye(entry.name)[0].startswith(prefix) and entry.is_dir()
+    ]
     for view, other in pairwise(sorted(views, key=lambda view: split_eye(view.name))):
         if split_eye(view.name) == split_eye(other.name):
             raise RecordingError(
                 f"{view}: expected one folder of this view, found {other}. Rename it"
             )
-    return views
+    return sorted(views, key=lambda view: natural_key(view.name))
 
 
 def _frames(view: Path) -> Iterator[tuple[str, Path]]:

@@ -78,9 +78,9 @@ def open_data_set(
     Raises `RecordingError` where `meta/` is broken, and where `views` names a depth map.
     """
     meta = read_meta(root, source.limits)
-    if asked := [view for view in meta.info.depth if view in (views or ())]:
+    if depth := [view for view in meta.info.depth if view in (views or ())]:
         raise RecordingError(
-            f"{root / MARKER}: data.views asks for {', '.join(asked)}, but is_depth_map is true "
+            f"{root / MARKER}: data.views asks for {', '.join(depth)}, but is_depth_map is true "
             "there: a depth map is no picture that the model can be shown. Leave it out of "
             "data.views"
         )

@@ -1,4 +1,4 @@
-"""The rows of one LeRobot episode in a parquet file: where they are, their columns and clock.
+"""Rows of parquet files whose declared sizes are within limits: columns, images and clock.
 
 LeRobot stores `timestamp` as float32, in which 0.1 is 0.10000000149. Where the stored times agree
 with frame number / `fps`, the clock is computed from the numbers, without that rounding.
@@ -70,11 +70,11 @@ class ParquetTable:
         no data.
         """
         names = file.schema_arrow.names
-        there = [name for name in wanted if name in names]
-        if twice := [name for name in there if names.count(name) > 1]:
+        present = [name for name in wanted if name in names]
+        if twice := [name for name in present if names.count(name) > 1]:
             raise INTACT.refusal(self.path, f"expected one column {twice[0]!r}, found more")
         # Arrow reads all leaves whose path begins with the column's name.
-        begins = tuple(f"{name}." for name in there)
+        begins = tuple(f"{name}." for name in present)
         schema = file.schema
         paths = [schema.column(place).path for place in range(len(schema))]
         leaves = [place for place, path in enumerate(paths) if f"{path}.".startswith(begins)]
@@ -84,16 +84,16 @@ class ParquetTable:
                 pages += max(0, leaf.total_uncompressed_size)
                 unpacked += max(0, leaf.total_uncompressed_size, leaf.num_values * _WIDEST)
         check_unpacked(self.path, unpacked, self.path.stat().st_size, self.limits)
-        return there, pages
+        return present, pages
 
     def rows(self, wanted: Sequence[str]) -> Iterator[tuple[str, dict[str, Any]]]:
         """The place of each row (for messages) and its cells in those wanted columns that exist."""
         with self.open() as file:
-            there, largest = self.check(file, wanted, range(file.num_row_groups))
+            present, largest = self.check(file, wanted, range(file.num_row_groups))
             # A text stored once may be in every row.
             rows = min(_BATCH_ROWS, _BATCH_BYTES // max(1, largest) + 1)
             number = 0
-            for batch in file.iter_batches(rows, columns=there, use_threads=False):
+            for batch in file.iter_batches(rows, columns=present, use_threads=False):
                 for row in batch.to_pylist():
                     yield f"{self.path}, row {number}", row
                     number += 1
@@ -136,16 +136,16 @@ def _read_numbers(
 ) -> pa.Table:
     with table.open() as file:
         groups = tuple(range(file.num_row_groups)) if groups is None else groups
-        there, _ = table.check(file, wanted, groups)
+        present, _ = table.check(file, wanted, groups)
         schema = file.schema_arrow
-        for name in there:
+        for name in present:
             kind = number = schema.field(name).type
             if isinstance(kind, pa.ListType | pa.LargeListType | pa.FixedSizeListType):
                 number = kind.value_type
             if not (pa.types.is_floating(number) or pa.types.is_integer(number)):
                 where = f"{table.path}, column {name!r}"
                 raise RECORDINGS.refusal(where, f"expected numbers, found {shown(str(kind))}")
-        return file.read_row_groups(list(groups), columns=there)
+        return file.read_row_groups(list(groups), columns=present)
 
 
 @dataclass(frozen=True)
@@ -174,24 +174,24 @@ class ParquetRows:
         """The encoded image of each of these rows (ascending, none twice), one row at a time."""
         groups, offset = self.table.groups(self.start, self.stop)
         where = f"{self.path}, column {column!r}"
-        asked = set(rows)
+        missing = set(rows)
         with self.table.open() as file:
-            there, _ = self.table.check(file, [column], groups)
-            kind = file.schema_arrow.field(column).type if there else pa.null()
+            present, _ = self.table.check(file, [column], groups)
+            kind = file.schema_arrow.field(column).type if present else pa.null()
             if not isinstance(kind, pa.StructType) or kind.get_field_index("bytes") < 0:
                 raise RECORDINGS.refusal(where, f"expected images, found {shown(str(kind))}")
             # One row at a time: a large image, stored once, may be in every row.
             batches = file.iter_batches(1, row_groups=groups, columns=[f"{column}.bytes"])
             for row, batch in enumerate(batches, offset - self.start):
-                if row not in asked:
+                if row not in missing:
                     continue
                 image = batch.column(column).field("bytes")[0].as_py()
                 if not isinstance(image, bytes):
                     where += f", row {self.start + row}"
                     raise RECORDINGS.refusal(where, "the cell has no image bytes")
                 yield row, image
-                asked.remove(row)
-                if not asked:
+                missing.remove(row)
+                if not missing:
                     return
         raise RECORDINGS.refusal(where, f"expected {self.stop - self.start} rows, found less")
 

@@ -158,8 +158,8 @@ class PickledRecording(InsertionRecording):
         sensor, where = content.sensor_data, f"{self._pickle}, 'sensor_data'"
         if sensor is None:
             path = self.path / _SENSOR_FILE
-            there = os.path.lexists(path)
-            return read_npy(path, self._overrides.limits) if there else None, str(path)
+            exists = os.path.lexists(path)
+            return read_npy(path, self._overrides.limits) if exists else None, str(path)
         if isinstance(sensor, _Readings):
             force, fpi = numeric(sensor.force, where), numeric(sensor.fpi, where)
             return sensor_rows(force, fpi, where), where

@@ -95,26 +95,19 @@ class VideoClip(CameraStream):
                 if frame is None or index != at:
                     # Complete groups of pictures between two frames are skipped, not decoded.
                     if frame is None or table.key_pts[index] > table.pts[at + 1]:
-                        # A new container stands at its first frame. A seek there may lead to a
-                        # later key frame of the same time.
+                        # A new container stands at its first frame.
                         if frame is not None or self._span.first or table.key_pts[index] > start:
                             container.seek(int(table.key_dts[index]), stream=stream)
-                        decoded, at = iter(container.decode(stream)), -1
-                    twins = index - max(at + 1, int(np.searchsorted(table.pts, table.pts[index])))
-                    frame = self._decode_until(decoded, index, twins)
-                    at = index
+                        decoded = iter(container.decode(stream))
+                    frame, at = self._decode_until(decoded, index), index
                 yield frame
 
-    def _decode_until(self, decoded: Iterator[VideoFrame], index: int, twins: int) -> VideoFrame:
-        """The frame that follows `twins` other frames of the same time."""
+    def _decode_until(self, decoded: Iterator[VideoFrame], index: int) -> VideoFrame:
         pts, key_pts, reason = int(self._table.pts[index]), int(self._table.key_pts[index]), ""
         try:
             for frame in decoded:
                 if frame.pts == pts and not frame.is_corrupt:
-                    if not twins:
-                        return frame
-                    twins -= 1
-                    continue
+                    return frame
                 # A damaged frame after the key frame spoils the frames predicted from it.
                 spoilt = frame.is_corrupt and frame.pts is not None and frame.pts >= key_pts
                 if frame.pts is None or frame.pts >= pts or spoilt:
@@ -139,10 +132,12 @@ class VideoClip(CameraStream):
                     "the episode out"
                 )
         table = np.array(sorted(packets, key=itemgetter(0)), np.int64).reshape(-1, 3).T
-        # Frames of equal time are counted from the first of them, so decoding starts before it.
-        first, stop = (np.searchsorted(table[0], table[0], side) for side in ("left", "right"))
-        before = np.where(stop - first > 1, np.maximum(first - 1, 0), np.arange(rows))
-        return _FrameTable(table[0], *table[1:, before])
+        if (same := np.flatnonzero(np.diff(table[0]) == 0)).size:
+            raise RecordingError(
+                f"{span.path}: frames {same[0]} and {same[0] + 1} of view {self.view!r} have the "
+                "same time, so no seek tells them apart. Convert the video to MP4"
+            )
+        return _FrameTable(*table)
 
 
 @contextmanager
