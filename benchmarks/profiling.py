@@ -13,7 +13,7 @@ import torch
 from torch.profiler import ProfilerActivity, profile
 
 from benchmarks.timing import Work
-from pipeline.data.row_range import RowRange
+from pipeline.data.episode import RowRange
 from pipeline.store import StoreBuild
 from pipeline.vlm.extractor import Extractor
 from pipeline.vlm.vision import VisionTower

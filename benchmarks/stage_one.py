@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.workload import Workload
-from pipeline.data.row_range import RowRange
+from pipeline.data.episode import RowRange
 from pipeline.extract.encoder import Encoder
 from pipeline.extract.engine import compute_here, fill, in_background
 from pipeline.extract.rows import ReadyRow, Row, RowPreparation

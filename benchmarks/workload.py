@@ -14,7 +14,7 @@ from tqdm import tqdm
 
 from pipeline.base.config import Params
 from pipeline.base.digests import ContentDigests
-from pipeline.data.row_range import RowFrames, RowRange
+from pipeline.data.episode import RowFrames, RowRange
 from pipeline.extract.engine import RANGE_ROWS
 from pipeline.extract.layout import build_arrays, finish_layout, lay_out
 from pipeline.extract.survey import CheckedEpisode, Survey, check_episodes, survey

@@ -9,8 +9,8 @@ from jaxtyping import Float64, Int64, UInt8
 from torch import Tensor
 
 from pipeline.base.errors import StoreMismatch
-from pipeline.data.row_range import Frames
-from pipeline.store import Batch
+from pipeline.data.episode import Frames
+from pipeline.store.batch import Batch
 
 Sample = Mapping[str, Any]
 """One tick: the fields of `UnifiedBatch` by name, without their batch axis."""

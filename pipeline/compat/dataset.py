@@ -23,8 +23,7 @@ from pipeline.compat.stores import (
     store_in_memory,
 )
 from pipeline.data import Recording, open_recordings
-from pipeline.data.episode import read_episode
-from pipeline.data.row_range import RowFrames
+from pipeline.data.episode import RowFrames, read_episode
 from pipeline.data.timeline import choose_action_rotation
 from pipeline.store import Episode, FeatureStore
 from pipeline.train.batches import Windows

@@ -16,9 +16,8 @@ from numpy.typing import NDArray
 from pipeline.base.differences import describe, differences
 from pipeline.base.errors import StoreMismatch
 from pipeline.data import Recording
-from pipeline.data.episode import ReadEpisode, common_embodiment
+from pipeline.data.episode import Frames, ReadEpisode, RowFrames, common_embodiment
 from pipeline.data.recording import absolute
-from pipeline.data.row_range import Frames, RowFrames
 from pipeline.data.timeline import tick_hz
 from pipeline.store import KEY_BYTES, SCHEMA, Episode, FeatureStore
 from pipeline.store.episodes import EpisodeRows, episode_arrays

@@ -140,18 +140,18 @@ def _check_views(recordings: Sequence[Recording], views: Sequence[str]) -> None:
 
     It reads recordings until all views were seen, pickles last.
     """
-    there: set[str] = set()
+    known: set[str] = set()
     for recording in sorted(recordings, key=lambda r: r.format == "old"):
-        if there.issuperset(views):
+        if known.issuperset(views):
             return
         try:
-            there.update(recording.all_views())
+            known.update(recording.all_views())
         except RecordingError:
             continue  # reported where the episode is read
-    unknown = [view for view in views if view not in there]
+    unknown = [view for view in views if view not in known]
     if unknown:
         raise RecordingError(
             f"data.views asks for {', '.join(unknown)}, which no recording has; "
-            f"there are {', '.join(sorted(there, key=natural_key)) or 'none'}. "
+            f"there are {', '.join(sorted(known, key=natural_key)) or 'none'}. "
             "Set data.views to some of these, or to null for all"
         )

@@ -16,13 +16,13 @@ from numpy.typing import NDArray
 from pipeline.base.border import shown
 from pipeline.base.config import MediaLimits
 from pipeline.base.errors import RecordingError
-from pipeline.data.media import DEFAULT_LIMITS, INTACT, RECORDINGS, check_unpacked
+from pipeline.data.recording import DEFAULT_LIMITS, INTACT, RECORDINGS, check_unpacked
 
 Numbers = NDArray[Any]
 """An array of real numbers of any width."""
 _HEADERS = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}
 MOST_CHANNELS = 65_536
-_MOST_COLUMNS, _LONGEST_LINE = 10_000, 2**20
+_LONGEST_LINE = 2**20
 
 
 def read_npz(
@@ -124,9 +124,6 @@ def read_csv(path: Path, columns: Sequence[str]) -> NDArray[np.float64]:
     """
     lines = _csv_lines(path)
     header = [name.strip() for name in next(lines, (0, []))[1]]
-    if len(header) > _MOST_COLUMNS:
-        why = f"expected at most {_MOST_COLUMNS:,} columns, found {len(header):,}"
-        raise RECORDINGS.refusal(path, why)
     for count, what in ((0, "missing column(s)"), (2, "twice the column(s)")):
         wrong = [name for name in columns if min(header.count(name), 2) == count]
         if wrong:

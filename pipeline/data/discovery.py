@@ -29,15 +29,15 @@ class FormatReader:
     open: Opener
 
 
-def _one(episode: Callable[[Path, Source, Sequence[str] | None], Recording]) -> Opener:
+def _single(episode: Callable[[Path, Source, Sequence[str] | None], Recording]) -> Opener:
     """The opener of a format with one episode per folder."""
     return lambda path, source, views: ([episode(path, source, views)], [])
 
 
 READERS = {
-    "new": FormatReader(windowed.MARKER, windowed.is_episode, _one(windowed.WindowedRecording)),
-    "old": FormatReader(pickled.MARKER, pickled.is_episode, _one(pickled.PickledRecording)),
-    "raw": FormatReader(raw.MARKER, raw.is_episode, _one(raw.RawRecording)),
+    "new": FormatReader(windowed.MARKER, windowed.is_episode, _single(windowed.WindowedRecording)),
+    "old": FormatReader(pickled.MARKER, pickled.is_episode, _single(pickled.PickledRecording)),
+    "raw": FormatReader(raw.MARKER, raw.is_episode, _single(raw.RawRecording)),
     "lerobot": FormatReader(lerobot.MARKER, lerobot.is_root, lerobot.open_data_set),
 }
 """In the order of detection."""
@@ -75,7 +75,6 @@ def episode_folders(source: Source, root: Path) -> list[tuple[Path, FormatReader
     unique: dict[Path, tuple[Path, FormatReader]] = {}
     for pattern in source.paths:
         full = absolute(root / pattern)
-        _check_pattern(source, pattern, full)
         matches = _matches(full)
         if not matches:
             lost = "" if root.is_dir() else f": {root} is no folder; see {command('doctor')}"
@@ -181,21 +180,6 @@ def _foreign(path: Path) -> str:
                 "it to LeRobot, or write a reader: docs/recipes/reader.md"
             )
     return ""
-
-
-def _check_pattern(source: Source, pattern: str, full: Path) -> None:
-    parts = Path(pattern).parts
-    too_long = len(parts) > 255 or max(map(len, parts), default=0) > 255
-    if _ODD.search(pattern) or too_long or parts.count("**") > 2:
-        raise RecordingError(
-            f"source {source.name!r}: expected a path or glob of names that folders can have, "
-            f"with at most two **, found {shown(pattern)}. Mend the source's path"
-        )
-    if full.parts[1:2] in ((), ("*",), ("**",)):
-        raise RecordingError(
-            f"source {source.name!r}: expected a folder to search for episodes, found {pattern!r}, "
-            "the whole file system. Set the source's path to the folder that holds the recordings"
-        )
 
 
 def _check_name(source: Source, folder: Path) -> None:

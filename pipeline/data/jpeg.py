@@ -4,27 +4,36 @@ import math
 import os
 import re
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from filecmp import cmp
+from io import BytesIO
 from itertools import pairwise
 from pathlib import Path, PurePath
 from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
+from PIL import Image, UnidentifiedImageError
 
 from pipeline.base.border import shown
 from pipeline.base.config import MediaLimits
 from pipeline.base.errors import RecordingError
-from pipeline.data.media import DEFAULT_LIMITS, FARTHEST_S, check_image_file, in_rgb, opened_image
-from pipeline.data.recording import CameraStream, entries, natural_key
+from pipeline.data.recording import (
+    DEFAULT_LIMITS,
+    FARTHEST_S,
+    INTACT,
+    RECORDINGS,
+    CameraStream,
+    check_limit,
+    entries,
+    natural_key,
+)
 
 THUMBNAIL = (32, 18)
 """Width and height of the thumbnail of a checked JPEG."""
 
 Frame = TypeVar("Frame")
-Seen = TypeVar("Seen")
 _EYES = ("left", "right")
 _SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".gif", ".tif", ".tiff", ".webp")
 """Suffixes of images; those that cannot be decoded are refused with their name."""
@@ -33,6 +42,17 @@ _PADDED = re.compile(r"0\d+")
 _COUNTS = 1e6
 """Whole numbers below it count frames; a clock in whole seconds since 1970 is above 1e9."""
 _VIEW = re.compile(r"view(?=\d)", re.IGNORECASE)
+_FORMATS = ("JPEG", "PNG")
+_AS_RGB = ("1", "L", "LA", "P", "PA", "RGB", "RGBA", "CMYK")
+"""Modes of images that are converted to RGB; transparent pixels become opaque."""
+_SIXTEEN_BITS = ("I;16", "I;16B", "I;16L", "I;16N")
+"""Modes of grey images of 16 bits; the upper eight bits are kept."""
+_IMAGE_BYTES = 16 * 2**20
+"""Bytes that an image file may have above one per pixel of the limits; a JPEG has about half."""
+_SCAN, _MOST_SCANS = b"\xff\xda", 100
+"""A progressive JPEG has about ten scans; each goes over all pixels again."""
+
+Image.MAX_IMAGE_PIXELS = None  # The header is compared with the source's limits instead.
 
 
 class JpegCamera(CameraStream):
@@ -55,15 +75,17 @@ class JpegCamera(CameraStream):
         self._limits = limits
 
     def check(self, indices: Sequence[int]) -> NDArray[np.uint8] | None:
-        seen = [self._each(check_image, index) for index in indices]
-        decoded = [thumbnail for thumbnail in seen if thumbnail is not None]
-        return np.stack(decoded) if seen and len(decoded) == len(seen) else None
+        files = [self.paths[index] for index in indices]
+        checked = [check_image(file, str(file), self._limits) for file in files]
+        thumbnails = [thumbnail for thumbnail in checked if thumbnail is not None]
+        return np.stack(thumbnails) if files and len(thumbnails) == len(files) else None
 
     def read(self, indices: Sequence[int]) -> Iterator[NDArray[np.uint8]]:
         last, frame = -1, None
         for index in indices:
             if frame is None or index != last:
-                last, frame = index, self._each(read_image, index)
+                file = self.paths[index]
+                last, frame = index, read_image(file, str(file), self._limits)
             yield frame
 
     def repeats(self) -> NDArray[np.bool_]:
@@ -73,9 +95,6 @@ class JpegCamera(CameraStream):
         for place in np.flatnonzero(same):
             same[place] = cmp(self.paths[place], self.paths[place + 1], shallow=False)
         return same
-
-    def _each(self, ask: Callable[[Path, str, MediaLimits], Seen], index: int) -> Seen:
-        return ask(self.paths[index], str(self.paths[index]), self._limits)
 
 
 def frame_time(path: PurePath) -> float:
@@ -99,10 +118,10 @@ def _check_not_counted(timed: Sequence[tuple[float, str]]) -> None:
         raise _no_time(Path(timed[-1][1]), f"frames counted from {first:g} to {last:g}")
 
 
-def _no_time(path: PurePath, found: str) -> RecordingError:
+def _no_time(path: PurePath, name: str) -> RecordingError:
     return RecordingError(
         f"{path}: expected a name that ends in the time in seconds, such as "
-        f"zed_left_1761551500.174.jpg, found {found}. Rename the frames by their times"
+        f"zed_left_1761551500.174.jpg, found {name}. Rename the frames by their times"
     )
 
 
@@ -173,8 +192,12 @@ def read_image(
     file: Path | bytes, where: str, limits: MediaLimits = DEFAULT_LIMITS
 ) -> NDArray[np.uint8]:
     """The image (height, width, 3), RGB as stored (EXIF orientation is ignored)."""
-    with opened_image(file, where, limits) as image:
-        return in_rgb(image)
+    with _opened_image(file, where, limits) as image:
+        if image.mode in _SIXTEEN_BITS:
+            upper = (np.asarray(image) >> 8).astype(np.uint8)
+            return np.repeat(upper[:, :, None], 3, axis=2)
+        image.info.pop("transparency", None)  # Pillow would warn about a palette's transparency
+        return np.asarray(image.convert("RGB"))
 
 
 def check_image(
@@ -185,7 +208,7 @@ def check_image(
     A JPEG is decoded at an eighth of its size; some of its pixels, evenly spread, are returned as a
     `THUMBNAIL`. A PNG is checked by its checksums and returns None.
     """
-    with opened_image(file, where, limits) as image:
+    with _opened_image(file, where, limits) as image:
         if image.format == "PNG":
             image.verify()
             return None
@@ -193,15 +216,54 @@ def check_image(
         return np.asarray(image.resize(THUMBNAIL, Image.Resampling.NEAREST).convert("RGB"))
 
 
+@contextmanager
+def _opened_image(
+    file: Path | bytes, where: str, limits: MediaLimits
+) -> Generator[Image.Image, None, None]:
+    """An open JPEG or PNG; an error inside becomes a `RecordingError` that begins with `where`.
+
+    Its header says that its pixels are within the limits; nothing is decoded yet.
+    """
+    unreadable = "cannot be decoded as an image"
+    with RECORDINGS.foreign(where, unreadable):
+        if isinstance(file, Path):
+            check_image_file(file, limits)
+            file = file.read_bytes()
+        try:
+            image = Image.open(BytesIO(file), formats=_FORMATS)
+        except UnidentifiedImageError:
+            why = f"{unreadable}: expected a JPEG or PNG, found {shown(file[:16])}"
+            raise RECORDINGS.refusal(where, why) from None
+        with image:
+            check_limit(where, image.width * image.height, limits.pixels, "pixels", "pixels")
+            if image.mode not in _AS_RGB + _SIXTEEN_BITS:
+                why = f"expected pixels of 8 bits, or grey ones of 16, found mode {image.mode!r}"
+                raise INTACT.refusal(where, why)
+            if image.format == "JPEG" and (scans := file.count(_SCAN)) > _MOST_SCANS:
+                why = f"expected at most {_MOST_SCANS} scans over the image, found {scans:,}"
+                raise INTACT.refusal(where, why)
+            yield image
+
+
+def check_image_file(file: Path, limits: MediaLimits) -> int:
+    """The size of a regular file; refused if no image within the limits needs so many bytes."""
+    size = RECORDINGS.check_file(file)
+    check_limit(file, size, _IMAGE_BYTES + limits.pixels, "pixels", "bytes")
+    return size
+
+
 def _view_folders(folder: Path, prefix: str) -> list[Path]:
-    there = [e for e in _entries(folder) if split_eye(e.name)[0].startswith(prefix) and e.is_dir()]
-    views = sorted((Path(entry.path) for entry in there), key=lambda view: natural_key(view.name))
+    views = [
+        Path(entry.path)
+        for entry in _entries(folder)
+        if split_eye(entry.name)[0].startswith(prefix) and entry.is_dir()
+    ]
     for view, other in pairwise(sorted(views, key=lambda view: split_eye(view.name))):
         if split_eye(view.name) == split_eye(other.name):
             raise RecordingError(
                 f"{view}: expected one folder of this view, found {other}. Rename it"
             )
-    return views
+    return sorted(views, key=lambda view: natural_key(view.name))
 
 
 def _frames(view: Path) -> Iterator[tuple[str, Path]]:

@@ -34,17 +34,18 @@ from pipeline.data.lerobot_meta import (
 )
 from pipeline.data.lerobot_rows import (
     CLOCK,
+    EPISODE,
     FRAME,
     ParquetCamera,
     ParquetRows,
+    ParquetTable,
     check_frames,
-    find_rows,
     matrix,
     read_clock,
     stored_clock,
 )
-from pipeline.data.media import RECORDINGS
 from pipeline.data.recording import (
+    RECORDINGS,
     ActionKind,
     CameraStream,
     Channels,
@@ -53,6 +54,7 @@ from pipeline.data.recording import (
     Recording,
     Stream,
     checked_stream,
+    natural_key,
 )
 from pipeline.data.video import VideoClip, VideoSpan
 
@@ -76,9 +78,9 @@ def open_data_set(
     Raises `RecordingError` where `meta/` is broken, and where `views` names a depth map.
     """
     meta = read_meta(root, source.limits)
-    if asked := [view for view in meta.info.depth if view in (views or ())]:
+    if depth := [view for view in meta.info.depth if view in (views or ())]:
         raise RecordingError(
-            f"{root / MARKER}: data.views asks for {', '.join(asked)}, but is_depth_map is true "
+            f"{root / MARKER}: data.views asks for {', '.join(depth)}, but is_depth_map is true "
             "there: a depth map is no picture that the model can be shown. Leave it out of "
             "data.views"
         )
@@ -128,7 +130,7 @@ class LeRobotRecording(Recording):
 
     @property
     def _rows(self) -> ParquetRows:
-        return find_rows(self._meta, self._entry)
+        return _find_rows(self._meta, self._entry)
 
     def listed_files(self) -> Iterator[Path]:
         """The data file and the wanted views' videos, as `meta/` names them."""
@@ -288,6 +290,38 @@ class LeRobotRecording(Recording):
         """The episode's sidecar file of that name; None where there is none."""
         path = sidecar(self.path, name, self._entry.index)
         return path if os.path.lexists(path) else None
+
+
+def _find_rows(meta: LeRobotMeta, entry: Entry) -> ParquetRows:
+    """The episode's rows, found by `episode_index`; the whole file if it has no such column.
+
+    The metadata's file_index can be stale (lerobot up to 0.4.4), so if the named file has none of
+    the rows, the other data files of v3.0 are searched. Raises `RecordingError` where the rows are
+    not as many as `meta/` says (with both counts), or not together.
+    """
+    shared, named = meta.info.shared, meta.data(entry)
+    others = sorted((meta.root / "data").glob("*/*.parquet"), key=natural_key) if shared else []
+    for path in [named, *(other for other in others if other != named and other.is_file())]:
+        table = ParquetTable(path, meta.limits)
+        columns = table.numbers((EPISODE, CLOCK))
+        if EPISODE in columns.column_names:
+            index = matrix(columns[EPISODE], 1, f"{path}, {EPISODE!r}")[:, 0]
+        elif shared:
+            raise RECORDINGS.refusal(path, f"missing column {EPISODE!r}")
+        else:
+            index = np.full(columns.num_rows, float(entry.index))
+        rows = np.flatnonzero(index == entry.index)
+        if rows.size:
+            of = f"rows of episode {entry.index}"
+            if rows.size != entry.length:
+                raise META.refusal(path, f"{rows.size} {of}, but meta/ says {entry.length}")
+            if rows[-1] - rows[0] + 1 != rows.size:
+                raise META.refusal(path, f"{of} are not together")
+            return ParquetRows(table, int(rows[0]), int(rows[-1]) + 1)
+    raise RecordingError(
+        f"{named}: has no row of episode {entry.index}{', nor has any other file' * shared}. "
+        "Give the data files their own names again, or copy the data set again"
+    )
 
 
 def action_kind(names: Sequence[str]) -> ActionKind:

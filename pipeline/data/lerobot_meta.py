@@ -20,9 +20,8 @@ from pipeline.base.border import Border, Document, Text, shown
 from pipeline.base.config import MediaLimits
 from pipeline.base.errors import RecordingError
 from pipeline.base.source import is_view_name
-from pipeline.data.media import Grouped
-from pipeline.data.parquet import ParquetTable
-from pipeline.data.recording import ActionKind, natural_key
+from pipeline.data.lerobot_rows import ParquetTable
+from pipeline.data.recording import ActionKind, Grouped, natural_key
 from pipeline.data.video import VideoSpan, frame_count
 
 T = TypeVar("T")
@@ -68,9 +67,8 @@ def sidecar(root: Path, name: str, index: int = 0) -> Path:
 
 
 class _VideoInfo(Document):
-    depth: Annotated[bool | None, Strict(False)] = Field(default=None, alias="is_depth_map")
-    video_depth: Annotated[bool | None, Strict(False)] = Field(
-        default=None, alias="video.is_depth_map"
+    depth: Annotated[bool | None, Strict(False)] = Field(
+        default=None, validation_alias=AliasChoices("is_depth_map", "video.is_depth_map")
     )
 
 
@@ -90,8 +88,7 @@ class Feature(Document):
     @property
     def is_depth_map(self) -> bool:
         """Whether its images are depth maps, by any of the entries for it."""
-        infos = [info for info in (self.info, self.video_info) if info is not None]
-        return any(info.depth or info.video_depth for info in infos)
+        return any(info is not None and info.depth for info in (self.info, self.video_info))
 
 
 class Vector(Document):

@@ -1,25 +1,33 @@
-"""The rows of one LeRobot episode in a parquet file: where they are, their columns and clock.
+"""Rows of parquet files whose declared sizes are within limits: columns, images and clock.
 
 LeRobot stores `timestamp` as float32, in which 0.1 is 0.10000000149. Where the stored times agree
 with frame number / `fps`, the clock is computed from the numbers, without that rounding.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from pipeline.base.border import shown
+from pipeline.base.config import MediaLimits
 from pipeline.base.errors import RecordingError
 from pipeline.data.jpeg import check_image, read_image
-from pipeline.data.lerobot_meta import META, Entry, LeRobotMeta
-from pipeline.data.media import RECORDINGS
-from pipeline.data.parquet import ParquetTable
-from pipeline.data.recording import CameraStream, check_clock, check_resolution, natural_key
+from pipeline.data.recording import (
+    INTACT,
+    RECORDINGS,
+    CameraStream,
+    check_clock,
+    check_resolution,
+    check_unpacked,
+)
 
 CLOCK = "timestamp"
 FRAME = "frame_index"
@@ -32,6 +40,112 @@ multiplied by a rounded 1 / fps."""
 _LATEST_S = 1e12
 """A clock in nanoseconds passes it after a quarter of an hour; one in seconds never does."""
 _UNITS = {"milliseconds": 1e3, "microseconds": 1e6, "nanoseconds": 1e9}
+_WIDEST = 8
+"""Most bytes of one number, or of the offset of a text."""
+_BATCH_BYTES = 64 * 2**20
+_BATCH_ROWS = 1024
+
+
+@dataclass(frozen=True)
+class ParquetTable:
+    """A parquet file; its methods raise `RecordingError`, which names it, for every fault."""
+
+    path: Path
+    limits: MediaLimits
+
+    @contextmanager
+    def open(self) -> Generator[pq.ParquetFile, None, None]:
+        """The open file; an error inside becomes a `RecordingError`."""
+        RECORDINGS.check_file(self.path)
+        unreadable = RECORDINGS.foreign(self.path, "cannot be read as parquet")
+        with unreadable, pq.ParquetFile(self.path) as file:
+            yield file
+
+    def check(
+        self, file: pq.ParquetFile, wanted: Sequence[str], groups: Sequence[int]
+    ) -> tuple[list[str], int]:
+        """Those wanted columns that the file has, and the most bytes that a cell can have.
+
+        Refuses a repeated column, and more bytes in these row groups than the limits allow; reads
+        no data.
+        """
+        names = file.schema_arrow.names
+        present = [name for name in wanted if name in names]
+        if twice := [name for name in present if names.count(name) > 1]:
+            raise INTACT.refusal(self.path, f"expected one column {twice[0]!r}, found more")
+        # Arrow reads all leaves whose path begins with the column's name.
+        begins = tuple(f"{name}." for name in present)
+        schema = file.schema
+        paths = [schema.column(place).path for place in range(len(schema))]
+        leaves = [place for place, path in enumerate(paths) if f"{path}.".startswith(begins)]
+        pages = unpacked = 0
+        for rows in map(file.metadata.row_group, groups):
+            for leaf in map(rows.column, leaves):
+                pages += max(0, leaf.total_uncompressed_size)
+                unpacked += max(0, leaf.total_uncompressed_size, leaf.num_values * _WIDEST)
+        check_unpacked(self.path, unpacked, self.path.stat().st_size, self.limits)
+        return present, pages
+
+    def rows(self, wanted: Sequence[str]) -> Iterator[tuple[str, dict[str, Any]]]:
+        """The place of each row (for messages) and its cells in those wanted columns that exist."""
+        with self.open() as file:
+            present, largest = self.check(file, wanted, range(file.num_row_groups))
+            # A text stored once may be in every row.
+            rows = min(_BATCH_ROWS, _BATCH_BYTES // max(1, largest) + 1)
+            number = 0
+            for batch in file.iter_batches(rows, columns=present, use_threads=False):
+                for row in batch.to_pylist():
+                    yield f"{self.path}, row {number}", row
+                    number += 1
+
+    def numbers(self, wanted: Sequence[str], groups: Sequence[int] | None = None) -> pa.Table:
+        """Those wanted columns that the file has, with numbers or lists of numbers.
+
+        Reads these row groups; all of them where `groups` is None.
+        """
+        return _read_numbers(self, self._stamp(), tuple(wanted), groups and tuple(groups))
+
+    def groups(self, start: int, stop: int) -> tuple[range, int]:
+        """The row groups that hold these rows, and the first row of the first group."""
+        counts = _row_counts(self, self._stamp())
+        if sum(counts) < stop or min(counts) < 0:
+            why = f"expected {stop} rows, found {sum(counts)} in its row groups"
+            raise RECORDINGS.refusal(self.path, why)
+        ends = np.cumsum(counts, dtype=np.int64)
+        first = int(np.searchsorted(ends, start, side="right"))
+        last = int(np.searchsorted(ends, stop, side="left"))
+        return range(first, last + 1), int(ends[first] - counts[first])
+
+    def _stamp(self) -> int:
+        """A number that changes with the file."""
+        RECORDINGS.check_file(self.path)
+        return self.path.stat().st_mtime_ns
+
+
+@lru_cache(maxsize=4)
+def _row_counts(table: ParquetTable, stamp: int) -> list[int]:
+    """Rows of each row group."""
+    with table.open() as file:
+        return [file.metadata.row_group(place).num_rows for place in range(file.num_row_groups)]
+
+
+# Cached, because hundreds of episodes, read in order, can share a file or even a row group.
+@lru_cache(maxsize=4)
+def _read_numbers(
+    table: ParquetTable, stamp: int, wanted: tuple[str, ...], groups: tuple[int, ...] | None
+) -> pa.Table:
+    with table.open() as file:
+        groups = tuple(range(file.num_row_groups)) if groups is None else groups
+        present, _ = table.check(file, wanted, groups)
+        schema = file.schema_arrow
+        for name in present:
+            kind = number = schema.field(name).type
+            if isinstance(kind, pa.ListType | pa.LargeListType | pa.FixedSizeListType):
+                number = kind.value_type
+            if not (pa.types.is_floating(number) or pa.types.is_integer(number)):
+                where = f"{table.path}, column {name!r}"
+                raise RECORDINGS.refusal(where, f"expected numbers, found {shown(str(kind))}")
+        return file.read_row_groups(list(groups), columns=present)
 
 
 @dataclass(frozen=True)
@@ -60,24 +174,24 @@ class ParquetRows:
         """The encoded image of each of these rows (ascending, none twice), one row at a time."""
         groups, offset = self.table.groups(self.start, self.stop)
         where = f"{self.path}, column {column!r}"
-        asked = set(rows)
+        missing = set(rows)
         with self.table.open() as file:
-            there, _ = self.table.check(file, [column], groups)
-            kind = file.schema_arrow.field(column).type if there else pa.null()
+            present, _ = self.table.check(file, [column], groups)
+            kind = file.schema_arrow.field(column).type if present else pa.null()
             if not isinstance(kind, pa.StructType) or kind.get_field_index("bytes") < 0:
                 raise RECORDINGS.refusal(where, f"expected images, found {shown(str(kind))}")
             # One row at a time: a large image, stored once, may be in every row.
             batches = file.iter_batches(1, row_groups=groups, columns=[f"{column}.bytes"])
             for row, batch in enumerate(batches, offset - self.start):
-                if row not in asked:
+                if row not in missing:
                     continue
                 image = batch.column(column).field("bytes")[0].as_py()
                 if not isinstance(image, bytes):
                     where += f", row {self.start + row}"
                     raise RECORDINGS.refusal(where, "the cell has no image bytes")
                 yield row, image
-                asked.remove(row)
-                if not asked:
+                missing.remove(row)
+                if not missing:
                     return
         raise RECORDINGS.refusal(where, f"expected {self.stop - self.start} rows, found less")
 
@@ -145,38 +259,6 @@ class ParquetCamera(CameraStream):
 
     def _where(self, row: int) -> str:
         return f"{self._rows.path}, column {self._column!r}, row {self._rows.start + row}"
-
-
-def find_rows(meta: LeRobotMeta, entry: Entry) -> ParquetRows:
-    """The episode's rows, found by `episode_index`; the whole file if it has no such column.
-
-    The metadata's file_index can be stale (lerobot up to 0.4.4), so if the named file has none of
-    the rows, the other data files of v3.0 are searched. Raises `RecordingError` where the rows are
-    not as many as `meta/` says (with both counts), or not together.
-    """
-    shared, named = meta.info.shared, meta.data(entry)
-    others = sorted((meta.root / "data").glob("*/*.parquet"), key=natural_key) if shared else []
-    for path in [named, *(other for other in others if other != named and other.is_file())]:
-        table = ParquetTable(path, meta.limits)
-        columns = table.numbers((EPISODE, CLOCK))
-        if EPISODE in columns.column_names:
-            index = matrix(columns[EPISODE], 1, f"{path}, {EPISODE!r}")[:, 0]
-        elif shared:
-            raise RECORDINGS.refusal(path, f"missing column {EPISODE!r}")
-        else:
-            index = np.full(columns.num_rows, float(entry.index))
-        rows = np.flatnonzero(index == entry.index)
-        if rows.size:
-            of = f"rows of episode {entry.index}"
-            if rows.size != entry.length:
-                raise META.refusal(path, f"{rows.size} {of}, but meta/ says {entry.length}")
-            if rows[-1] - rows[0] + 1 != rows.size:
-                raise META.refusal(path, f"{of} are not together")
-            return ParquetRows(table, int(rows[0]), int(rows[-1]) + 1)
-    raise RecordingError(
-        f"{named}: has no row of episode {entry.index}{', nor has any other file' * shared}. "
-        "Give the data files their own names again, or copy the data set again"
-    )
 
 
 def matrix(column: pa.ChunkedArray, width: int, where: str) -> NDArray[np.float64]:

@@ -1,19 +1,25 @@
 """The recorder's old format: a pickle with everything but the frames, and no clock.
 
 Row k of actions and sensor is at t0 + k / action_hz; t0 is the earliest time in a frame's name.
+
+A pickle names functions and classes, and an unpickler calls them. `load_plain` knows only the names
+needed for arrays, numpy scalars, bytes and sets, and replaces each with a function of its own that
+checks its arguments. It refuses any other name before it looks it up.
 """
 
 import os
-from collections.abc import Collection, Mapping, Sequence
-from functools import cached_property
+import pickle
+import re
+from collections.abc import Callable, Collection, Mapping, Sequence
+from functools import cached_property, partial
 from pathlib import Path, PurePath, PurePosixPath, PureWindowsPath
 from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BeforeValidator, Field, InstanceOf, Strict
+from pydantic import AfterValidator, BeforeValidator, Field, InstanceOf, Strict
 
-from pipeline.base.border import Document, Text
+from pipeline.base.border import Document, Text, shown
 from pipeline.base.config import Source
 from pipeline.base.errors import RecordingError
 from pipeline.base.source import ViewName
@@ -27,13 +33,15 @@ from pipeline.data.insertion import (
     sensor_rows,
 )
 from pipeline.data.jpeg import frame_time, name_views, split_eye
-from pipeline.data.media import RECORDINGS, Rate
-from pipeline.data.plain_pickle import load_plain
 from pipeline.data.recording import (
+    INTACT,
+    RECORDINGS,
     Channels,
     Nominal,
+    Rate,
     RecordedAction,
     Stream,
+    check_limit,
     checked_stream,
 )
 
@@ -44,36 +52,35 @@ _ROBOT_HZ = 100.0
 ACTION = Channels(
     ("dx", "dy", "dz", "da", "db", "dr", "gripper"), ("mm",) * 3 + ("deg",) * 3 + ("",)
 )
-
-
-_Array = InstanceOf[NDArray[Any]]
+_DTYPE = re.compile(r"[<>=|]?(\?|[biuf][1248]|[SU]\d{1,6})")
+_PickledArray = Annotated[InstanceOf[NDArray[Any]], AfterValidator(np.asarray)]
 
 
 class _Metadata(Document):
     action_hz: Rate | None = None
     robot_hz: Rate | None = None
     has_sensor: bool | None = None
-    num_robot_states: int | None = Field(default=None, ge=0)
+    num_robot_states: int | None = Field(default=None, ge=0, le=10**9)
 
 
 class _Readings(Document):
-    force: _Array
+    force: _PickledArray
     """(N, 1)."""
-    fpi: _Array
+    fpi: _PickledArray
     """(N, 1025)."""
 
 
 class _Content(Document):
     """What `data.pkl` holds."""
 
-    action: _Array
+    action: _PickledArray
     """(N, 7)."""
-    sensor_data: _Array | _Readings | None = None
+    sensor_data: _PickledArray | _Readings | None = None
     """(N, 1026), or its two parts."""
     image: dict[ViewName, Annotated[list[Text], Strict(False)]] | None = None
     """Paths as recorded, by view."""
     instruction: Text | None = None
-    metadata: Annotated[_Metadata, BeforeValidator(lambda told: told or {})] = _Metadata()
+    metadata: Annotated[_Metadata, BeforeValidator(lambda entries: entries or {})] = _Metadata()
 
 
 def is_episode(folder: Path, names: Collection[str]) -> bool:
@@ -99,8 +106,8 @@ class PickledRecording(InsertionRecording):
         rate_hz = content.metadata.action_hz or _ACTION_HZ
         time = self._start + np.arange(len(values)) / rate_hz
         stream = checked_stream(ACTION, time, values, f"{self._pickle}, 'action'")
-        told = self._overrides.action_kind
-        kind = "delta" if told == "auto" else told
+        kind = self._overrides.action_kind
+        kind = "delta" if kind == "auto" else kind
         return RecordedAction(ACTION, stream.time, stream.values, kind, rate_hz)
 
     def sensor(self) -> Stream | None:
@@ -127,8 +134,8 @@ class PickledRecording(InsertionRecording):
     def nominal(self) -> Nominal:
         """The streams that the pickle's metadata list; the clocks are made from its rates."""
         metadata = self._content().metadata
-        told = promised(metadata, sensor=("has_sensor",), state=("num_robot_states",))
-        return Nominal(streams=told, where=f"{MARKER}'s metadata")
+        streams = promised(metadata, sensor=("has_sensor",), state=("num_robot_states",))
+        return Nominal(streams, where=f"{MARKER}'s metadata")
 
     def _content(self) -> _Content:
         """The pickle's content, possibly without the sensor's readings."""
@@ -151,8 +158,8 @@ class PickledRecording(InsertionRecording):
         sensor, where = content.sensor_data, f"{self._pickle}, 'sensor_data'"
         if sensor is None:
             path = self.path / _SENSOR_FILE
-            there = os.path.lexists(path)
-            return read_npy(path, self._overrides.limits) if there else None, str(path)
+            exists = os.path.lexists(path)
+            return read_npy(path, self._overrides.limits) if exists else None, str(path)
         if isinstance(sensor, _Readings):
             force, fpi = numeric(sensor.force, where), numeric(sensor.fpi, where)
             return sensor_rows(force, fpi, where), where
@@ -210,3 +217,87 @@ class PickledRecording(InsertionRecording):
 
 def _pure(recorded: str) -> PurePath:
     return PureWindowsPath(recorded) if "\\" in recorded else PurePosixPath(recorded)
+
+
+class _Refused(Exception):
+    """The pickle asks for something that is not allowed; other errors mean damage."""
+
+
+class _Dtype:
+    """Replaces `numpy.dtype`, whose own state could turn numbers into pointers."""
+
+    def __init__(self, code: Any, *_: Any) -> None:
+        if not isinstance(code, str) or not _DTYPE.fullmatch(code):
+            raise _Refused(f"an array of dtype {shown(code)}")
+        self.dtype = np.dtype(code)
+
+    def __setstate__(self, state: Any) -> None:
+        self.dtype = self.dtype.newbyteorder(state[1])
+
+
+class _Array(np.ndarray):
+    """An array whose state follows it in the pickle, as in protocols below 5."""
+
+    def __setstate__(self, state: Any, /) -> None:
+        _, shape, dtype, fortran, data = state
+        super().__setstate__((1, shape, dtype.dtype, fortran, data))
+
+
+def _frombuffer(data: Any, dtype: _Dtype, shape: Any, order: str, axes: Any = None) -> Any:
+    if not isinstance(data, bytes | bytearray):  # an array would share its memory
+        raise _Refused("an array that shares the memory of another")
+    array = np.frombuffer(data, dtype.dtype).reshape(shape, order="F" if order == "F" else "C")
+    return array if axes is None else array.transpose(axes)
+
+
+def _latin1(text: str, encoding: str) -> bytes:
+    """Bytes as protocol 2 writes them."""
+    if encoding != "latin1":
+        raise _Refused(f"encoding {shown(encoding)}")
+    return text.encode("latin1")
+
+
+_CALLS: dict[str, Callable[..., Any]] = {
+    "numpy.dtype": _Dtype,
+    "numpy._core.multiarray._reconstruct": lambda *_: np.empty(0, np.int8).view(_Array),
+    "numpy._core.multiarray.scalar": lambda dtype, data: np.frombuffer(data, dtype.dtype)[0].item(),
+    "numpy._core.numeric._frombuffer": _frombuffer,
+    "_codecs.encode": _latin1,
+    "collections.OrderedDict": dict,
+    "builtins.set": set,
+    "builtins.frozenset": frozenset,
+    "builtins.bytes": lambda: b"",
+}
+"""The functions that replace the names in a pickle."""
+
+
+class _Unpickler(pickle.Unpickler):
+    def find_class(self, module: str, name: str, /) -> Any:
+        # The spelling of numpy 2 and protocol 3.
+        known = f"{module}.{name}".replace("numpy.core.", "numpy._core.")
+        known = known.replace("__builtin__.", "builtins.")
+        if known == "numpy.ndarray":  # an argument of _reconstruct, never called
+            return None
+        if known not in _CALLS:
+            raise _Refused(shown(known).strip("'"))
+        # A pickle can set attributes of a named object, so it gets a new one each time.
+        return partial(_CALLS[known])
+
+
+def load_plain(path: Path, most: int) -> Any:
+    """The content of a pickle of numpy arrays, scalars, dicts, lists, tuples, sets and text.
+
+    Numpy scalars become plain numbers. Raises `RecordingError`, and executes nothing, where the
+    pickle asks for anything else, is damaged, or has more than `most` bytes.
+    """
+    check_limit(path, RECORDINGS.check_file(path), most, "array_bytes", "bytes")
+    # Damaged bytes make numpy and the unpickler raise almost any exception.
+    with RECORDINGS.foreign(path, "damaged pickle"), path.open("rb") as file:
+        try:
+            return _Unpickler(file, encoding="latin1").load()
+        except _Refused as error:
+            raise INTACT.refusal(
+                path,
+                f"refused: it asks for {error}; only numpy arrays and plain containers are "
+                "admitted, because a pickle can run code. Nothing was executed",
+            ) from None

@@ -13,8 +13,7 @@ from pipeline.base.errors import RecordingError
 from pipeline.data.arrays import member, read_npz
 from pipeline.data.insertion import SENSOR, InsertionRecording, read_state_csv, sensor_rows
 from pipeline.data.jpeg import list_empty_views, list_views
-from pipeline.data.media import RECORDINGS, Grouped
-from pipeline.data.recording import Stream, checked_stream
+from pipeline.data.recording import RECORDINGS, Grouped, Stream, checked_stream
 
 _STATE_FILES = "robot_state_*.csv"
 _SENSOR_FILES = "sensor_data_*.npz"

@@ -16,21 +16,45 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 
 from pipeline.base.arrays import first_non_finite, non_finite
-from pipeline.base.config import Source
+from pipeline.base.border import Border, Document, Text
+from pipeline.base.config import MediaLimits, Source
 from pipeline.base.digests import joint_digest
 from pipeline.base.errors import RecordingError
 from pipeline.base.source import CLOCK_SLACK_S
-from pipeline.data.media import FARTHEST_S, RECORDINGS
 
+RECORDINGS = Border(RecordingError, "Copy the file again, or leave the episode out.")
+INTACT = Border(RecordingError, "Write the file again as expected, or leave the episode out.")
+"""Refuses an undamaged file; a new copy would be refused too."""
+DEFAULT_LIMITS = MediaLimits()
+"""Limits of a file that does not belong to a source."""
+FARTHEST_S = 1e20
+"""Largest absolute time: nanoseconds since 1970 are 1e18."""
+Seconds = Annotated[float, Field(ge=-FARTHEST_S, le=FARTHEST_S)]
+Rate = Annotated[float, Field(ge=1e-3, le=1e6)]
+"""Rate of a stream, in Hz."""
+_ALWAYS_TAKEN = 256 * 2**20
+"""Unpacked bytes that are allowed at any ratio: a constant stream is packed a thousandfold."""
 _MOST_BYTES = 2**38
 """Largest allowed size of an episode's file; a larger one is refused unread."""
 ActionKind = Literal["absolute", "velocity", "delta"]
+
+
+class Grouped(Document):
+    """Metadata of an episode that may name its group."""
+
+    group: Text | Annotated[int, Field(ge=-(10**9), lt=10**9)] | None = None
+
+    @property
+    def group_name(self) -> str | None:
+        """The episode's group as text; None where it names none."""
+        return None if self.group in (None, "") else str(self.group)
 
 
 @dataclass(frozen=True)
@@ -275,6 +299,22 @@ def check_resolution(stored: NDArray[Any], where: str) -> None:
             f"too coarse for {len(time)} of them in {time[-1] - time[0]:g} s; expected float64, "
             "not rounded. Export the recording again with such times, or leave it out"
         )
+
+
+def check_limit(where: Path | str, count: int, most: int, name: str, what: str) -> None:
+    """Refuse a count above `limits.<name>` of its source."""
+    if count > most:
+        raise Border(
+            RecordingError,
+            f"Leave the episode out, or if this is right, raise limits.{name} of its source.",
+        ).refusal(where, f"expected at most {most:,} {what}, found {count:,}")
+
+
+def check_unpacked(where: Path | str, unpacked: int, packed: int, limits: MediaLimits) -> None:
+    """Refuse an array or table with too many unpacked bytes, or too high a ratio, before a read."""
+    ratio = max(_ALWAYS_TAKEN, int(limits.ratio * packed))
+    for most, name in ((limits.array_bytes, "array_bytes"), (ratio, "ratio")):
+        check_limit(where, unpacked, most, name, "bytes unpacked")
 
 
 def content_digest(recording: Recording, digest_of: Callable[[Path], str]) -> str:

@@ -123,11 +123,11 @@ def build_timeline(
 
 
 def choose_action_rotation(
-    asked: Literal["auto", "rotvec", "euler_delta"], recordings: Sequence[Recording]
+    rotation: Literal["auto", "rotvec", "euler_delta"], recordings: Sequence[Recording]
 ) -> ActionRotation:
     """The requested convention; `auto` is rotvec if every recording has poses, else Euler."""
-    if asked != "auto":
-        return asked
+    if rotation != "auto":
+        return rotation
     return "rotvec" if all(recording.has_poses for recording in recordings) else "euler_delta"
 
 

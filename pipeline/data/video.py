@@ -5,13 +5,13 @@ clip. A clip is the whole file, or the part of a shared file that holds one epis
 """
 
 import sys
-from collections.abc import Iterator, Sequence
-from contextlib import suppress
+from collections.abc import Generator, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import cached_property
 from operator import itemgetter
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import av
 import numpy as np
@@ -22,9 +22,12 @@ from numpy.typing import NDArray
 
 from pipeline.base.config import MediaLimits
 from pipeline.base.errors import RecordingError
-from pipeline.data.media import DEFAULT_LIMITS, opened_video
-from pipeline.data.recording import CameraStream
+from pipeline.data.recording import DEFAULT_LIMITS, INTACT, RECORDINGS, CameraStream, check_limit
 
+_CODECS = ("av1", "h264", "hevc", "mjpeg", "mpeg4", "vp8", "vp9")
+_AV1_DECODERS = frozenset({"libdav1d", "libaom-av1", "libgav1"})
+_CONTAINERS = {"format_whitelist": "mov,mp4,matroska,webm,avi", "protocol_whitelist": "file"}
+"""No playlists, and no format that opens other files."""
 _MOST_SEEKS = 1000
 
 
@@ -92,26 +95,19 @@ class VideoClip(CameraStream):
                 if frame is None or index != at:
                     # Complete groups of pictures between two frames are skipped, not decoded.
                     if frame is None or table.key_pts[index] > table.pts[at + 1]:
-                        # A new container stands at its first frame. A seek there may lead to a
-                        # later key frame of the same time.
+                        # A new container stands at its first frame.
                         if frame is not None or self._span.first or table.key_pts[index] > start:
                             container.seek(int(table.key_dts[index]), stream=stream)
-                        decoded, at = iter(container.decode(stream)), -1
-                    twins = index - max(at + 1, int(np.searchsorted(table.pts, table.pts[index])))
-                    frame = self._decode_until(decoded, index, twins)
-                    at = index
+                        decoded = iter(container.decode(stream))
+                    frame, at = self._decode_until(decoded, index), index
                 yield frame
 
-    def _decode_until(self, decoded: Iterator[VideoFrame], index: int, twins: int) -> VideoFrame:
-        """The frame that follows `twins` other frames of the same time."""
+    def _decode_until(self, decoded: Iterator[VideoFrame], index: int) -> VideoFrame:
         pts, key_pts, reason = int(self._table.pts[index]), int(self._table.key_pts[index]), ""
         try:
             for frame in decoded:
                 if frame.pts == pts and not frame.is_corrupt:
-                    if not twins:
-                        return frame
-                    twins -= 1
-                    continue
+                    return frame
                 # A damaged frame after the key frame spoils the frames predicted from it.
                 spoilt = frame.is_corrupt and frame.pts is not None and frame.pts >= key_pts
                 if frame.pts is None or frame.pts >= pts or spoilt:
@@ -136,10 +132,44 @@ class VideoClip(CameraStream):
                     "the episode out"
                 )
         table = np.array(sorted(packets, key=itemgetter(0)), np.int64).reshape(-1, 3).T
-        # Frames of equal time are counted from the first of them, so decoding starts before it.
-        first, stop = (np.searchsorted(table[0], table[0], side) for side in ("left", "right"))
-        before = np.where(stop - first > 1, np.maximum(first - 1, 0), np.arange(rows))
-        return _FrameTable(table[0], *table[1:, before])
+        if (same := np.flatnonzero(np.diff(table[0]) == 0)).size:
+            raise RecordingError(
+                f"{span.path}: frames {same[0]} and {same[0] + 1} of view {self.view!r} have the "
+                "same time, so no seek tells them apart. Convert the video to MP4"
+            )
+        return _FrameTable(*table)
+
+
+@contextmanager
+def opened_video(
+    path: Path, limits: MediaLimits
+) -> Generator[tuple[InputContainer, VideoStream], None, None]:
+    """An open video and its first stream; an error inside becomes a `RecordingError`.
+
+    The header and the decoder both keep the frames within the limits.
+    """
+    RECORDINGS.check_file(path)
+    unreadable = "cannot be read as video (MP4, Matroska, WebM or AVI)"
+    with (
+        RECORDINGS.foreign(path, unreadable),
+        av.open(f"file:{path}", container_options=_CONTAINERS) as container,
+    ):
+        if not container.streams.video:
+            raise RECORDINGS.refusal(path, "holds no video")
+        stream = container.streams.video[0]
+        context: Any = stream.codec_context
+        codec = context.codec.canonical_name if context else "one that PyAV does not know"
+        if codec not in _CODECS:
+            raise INTACT.refusal(path, f"expected a video of {', '.join(_CODECS)}, found {codec}")
+        if codec == "av1" and not _AV1_DECODERS & av.codecs_available:
+            raise RecordingError(
+                f"{path}: the video is AV1 and this PyAV build decodes none; "
+                "install a wheel that has libdav1d: pip install --upgrade av"
+            )
+        check_limit(path, context.width * context.height, limits.pixels, "pixels", "pixels")
+        context.options = {"max_pixels": str(limits.pixels)}
+        context.thread_count = 1
+        yield container, stream
 
 
 def frame_count(path: Path, limits: MediaLimits) -> int:

@@ -28,8 +28,17 @@ from pipeline.data.insertion import (
     robot_state_file,
 )
 from pipeline.data.jpeg import list_empty_views, list_views, split_eye
-from pipeline.data.media import RECORDINGS, Grouped, Rate, Seconds
-from pipeline.data.recording import Nominal, Stream, check_clock, check_resolution, checked_stream
+from pipeline.data.recording import (
+    RECORDINGS,
+    Grouped,
+    Nominal,
+    Rate,
+    Seconds,
+    Stream,
+    check_clock,
+    check_resolution,
+    checked_stream,
+)
 
 MARKER = "metadata.json"
 _SENSOR_FILE = "sensor_data.npz"
@@ -37,7 +46,7 @@ _LEFT_WITHOUT = frozenset({_SENSOR_FILE, "robot_states.npz"})
 """Files that mark a folder without metadata.json as a broken episode, which is reported."""
 _OVERLAP = 0.75
 """Windows certainly overlap if the clock advances by less than this fraction of a window."""
-_PAIRS_ASKED = 16
+_PAIRS_SAMPLED = 16
 _SHIFTS_TRIED = 32
 """Most shifts that are compared, the nearest to the expected stride first: readings agree at one
 shift or, if they are constant, at all shifts."""
@@ -135,10 +144,10 @@ class WindowedRecording(InsertionRecording):
 
     def _view_files(self) -> Mapping[str, list[Path]]:
         views, metadata = list_views(self.path / "images"), self._metadata
-        there = {split_eye(view)[0] for view in views}
+        recorded = {split_eye(view)[0] for view in views}
         listed = {split_eye(view)[0] for view in metadata.camera_views or () if self._wants(view)}
         most = max(map(len, views.values()), default=0)
-        if lost := sorted(listed - there):
+        if lost := sorted(listed - recorded):
             what = f"camera_views has {', '.join(lost)}, and images/ no frame of it"
         elif self._views is None and most < (metadata.camera_frames_count or 0):
             what = f"camera_frames_count is {metadata.camera_frames_count}, and images/ has {most}"
@@ -243,16 +252,16 @@ def _check_finite(windows: Numbers, where: str) -> None:
 
 def _proved_stride(windows: Numbers) -> int | None:
     """The stride at which most of the sampled window pairs agree; None if they do not show one."""
-    asked = np.unique(np.linspace(1, len(windows) - 1, _PAIRS_ASKED).astype(int))
+    sampled = np.unique(np.linspace(1, len(windows) - 1, _PAIRS_SAMPLED).astype(int))
     votes: Counter[int] = Counter()
-    for index in asked:
+    for index in sampled:
         previous, window = windows[index - 1], windows[index]
         shifts = _first_rows(previous, window)
         # Readings that do not change agree at every shift and prove nothing.
         if len(shifts) == 1 and _agree(previous, window, shifts[0]):
             votes[shifts[0]] += 1
     stride, count = max(votes.items(), key=lambda vote: vote[1], default=(0, 0))
-    return stride if 2 * count > len(asked) else None
+    return stride if 2 * count > len(sampled) else None
 
 
 def _first_rows(previous: Numbers, window: Numbers) -> Sequence[int]:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from pipeline.base.digests import file_digest
 from pipeline.base.errors import RecordingError
 from pipeline.data import Recording, content_digest, open_recording
-from pipeline.data.row_range import RowRange
+from pipeline.data.episode import RowRange
 from pipeline.store import Episode, FeatureStore
 from pipeline.train.batches import Ticks, evenly
 

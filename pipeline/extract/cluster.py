@@ -49,7 +49,7 @@ from pipeline.base.errors import (
     StoreIncomplete,
 )
 from pipeline.base.scheduler import client_of, private_cluster, quiet
-from pipeline.data.row_range import RowFrames, by_episode
+from pipeline.data.episode import RowFrames, by_episode
 from pipeline.extract.engine import RowEngine, Speed
 from pipeline.extract.rows import FeatureBlock, Row, RowMarks, WrittenRows, row_frames
 from pipeline.extract.survey import Survey

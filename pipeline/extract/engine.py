@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from pipeline.base.digests import ContentDigests
-from pipeline.data.row_range import RowFrames, by_episode
+from pipeline.data.episode import RowFrames, by_episode
 from pipeline.extract.rows import (
     FeatureBlock,
     KnownRow,

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.base.source import spread
-from pipeline.data.row_range import RowFrames
+from pipeline.data.episode import RowFrames
 from pipeline.extract.rows import row_frames
 from pipeline.extract.state import Say, StorePlaces
 from pipeline.extract.survey import Survey

@@ -17,7 +17,7 @@ from pipeline.base.differences import describe, differences
 from pipeline.base.digests import ContentDigests, ledger_path
 from pipeline.base.errors import StoreMismatch
 from pipeline.base.text import capped
-from pipeline.data.row_range import RowFrames
+from pipeline.data.episode import RowFrames
 from pipeline.extract.encoder import Encoder
 from pipeline.extract.rows import ReadyRow, RowPreparation
 from pipeline.extract.survey import survey

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from pipeline.data.row_range import Frames, RowFrames, RowRange
+from pipeline.data.episode import Frames, RowFrames, RowRange
 from pipeline.extract.survey import Survey
 from pipeline.store import FEATURES, RowSource, StoreBuild
 from pipeline.vlm.preparation import PreparedRow, Preparer

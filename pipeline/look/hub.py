@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from pipeline.base.config import Params
 from pipeline.base.errors import HubError, StoreMismatch
-from pipeline.base.table import Table
+from pipeline.base.text import Table
 from pipeline.policy.checkpoint import DOCUMENT, PolicyCheckpoint, find_policy, load_policy
 from pipeline.store import FeatureStore
 from pipeline.vlm.checkpoint_folder import could_be_hub_id, folder_here

@@ -9,7 +9,7 @@ from pipeline.base.differences import describe, differences
 from pipeline.base.errors import RecordingError, StoreMismatch
 from pipeline.data.arrays import member, read_npz
 from pipeline.data.lerobot_meta import sidecar
-from pipeline.data.media import RECORDINGS
+from pipeline.data.recording import RECORDINGS
 from pipeline.robot.run_recording import RUN, RunDocument
 from pipeline.store import FeatureStore
 

@@ -36,7 +36,7 @@ from pipeline.base.files import (
 )
 from pipeline.data.lerobot import ACTION, STATE
 from pipeline.data.lerobot_writer import write_sidecar, write_v30
-from pipeline.data.media import RECORDINGS
+from pipeline.data.recording import RECORDINGS
 
 RUN: Final = "run.json"
 READINGS: Final = ("state", "sensor")

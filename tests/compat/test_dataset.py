@@ -14,6 +14,7 @@ from torch.utils.data import DataLoader
 from pipeline.base.config import Source, SplitParams, TrainHeadParams
 from pipeline.base.errors import ConfigError, RecordingError, StoreIncomplete, StoreMismatch
 from pipeline.base.observation import Observation
+from pipeline.compat.unified import QwenVLAUnified
 from pipeline.data import Channels, RecordedAction, open_recordings
 from pipeline.data.timeline import build_timeline
 from pipeline.data.windowed import WindowedRecording
@@ -24,8 +25,8 @@ from pipeline.datasets import (
     async_collate_fn_with_sensor,
     unified_collate_fn,
 )
-from pipeline.models import QwenVLAUnified
-from pipeline.store import Batch, FeatureStore
+from pipeline.store import FeatureStore
+from pipeline.store.batch import Batch
 from pipeline.train.split import split_by_episode
 
 SMALL = TrainHeadParams.model_validate(

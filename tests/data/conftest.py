@@ -4,6 +4,7 @@ import json
 import pickle
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cache
 from io import BytesIO
 from pathlib import Path
 from types import SimpleNamespace
@@ -21,14 +22,19 @@ from pipeline.data import Recording, open_recordings
 
 START = 1762581333.25
 STATE_NAMES = [f"joint_{i}" for i in range(1, 7)] + [f"pose_{axis}" for axis in "xyzabr"]
-DATA_PATHS = {
-    "v2.0": "data/chunk-{episode_chunk:03d}/episode_{episode_index:06d}.parquet",
-    "v3.0": "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet",
+PATHS = {
+    "v2.0": (
+        "data/chunk-{episode_chunk:03d}/episode_{episode_index:06d}.parquet",
+        "videos/chunk-{episode_chunk:03d}/{video_key}/episode_{episode_index:06d}.mp4",
+    ),
+    "v3.0": (
+        "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet",
+        "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4",
+    ),
 }
-VIDEO_PATHS = {
-    "v2.0": "videos/chunk-{episode_chunk:03d}/{video_key}/episode_{episode_index:06d}.mp4",
-    "v3.0": "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4",
-}
+VIEW_KEY = "observation.images.top"
+TASKS = {"place": 7, "pick": 3}
+EPISODES_V3 = "meta/episodes/chunk-000/file-000.parquet"
 
 
 @dataclass
@@ -164,13 +170,22 @@ def write_video(
     b_frames: int = 0,
 ) -> Path:
     path.parent.mkdir(parents=True, exist_ok=True)
-    with av.open(str(path), "w") as container:
-        options = {"g": str(group), "bf": str(b_frames), "preset": "12" if "av1" in codec else ""}
-        if "264" in codec:
-            options |= {"preset": "ultrafast", "sc_threshold": "0"}
-        stream = container.add_stream(
-            codec, rate=fps, options={k: v for k, v in options.items() if v}
-        )
+    path.write_bytes(_video((*shades,), path.suffix[1:], fps, codec, group, b_frames))
+    return path
+
+
+@cache
+def _video(
+    shades: Sequence[int], suffix: str, fps: int, codec: str, group: int, b_frames: int
+) -> bytes:
+    options = {"g": str(group), "bf": str(b_frames)}
+    if "264" in codec:
+        options |= {"preset": "ultrafast", "sc_threshold": "0"}
+    elif "av1" in codec:
+        options |= {"preset": "12"}
+    buffer = BytesIO()
+    with av.open(buffer, "w", {"mkv": "matroska"}.get(suffix, suffix)) as container:
+        stream = container.add_stream(codec, rate=fps, options=options)
         if codec == "mpeg4":
             stream.bit_rate = 4_000_000
         stream.width, stream.height, stream.pix_fmt = 64, 48, "yuv420p"
@@ -178,7 +193,7 @@ def write_video(
             frame = av.VideoFrame.from_ndarray(shaded(shade), format="rgb24")
             container.mux(stream.encode(frame))
         container.mux(stream.encode())
-    return path
+    return buffer.getvalue()
 
 
 def shade_of(index: int) -> int:
@@ -199,39 +214,34 @@ def write_lerobot(
     version: str = "v2.1",
     lengths: Sequence[int] = (7, 5, 9),
     image: bool = False,
-    group: int = 4,
     features: Mapping[str, Any] | None = None,
     file_of: Sequence[int] | None = None,
     tasks: Sequence[str] = ("pick", "place", "pick"),
     **columns: Any,
 ) -> Path:
-    """A data set at 10 fps with a jittered clock; in v3.0 `file_of` says which file an episode is
-    in (both data and video)."""
-    rng = np.random.default_rng(1)
-    v3 = version == "v3.0"
-    key = "observation.images.top"
+    """A data set at 10 fps with a jittered clock; in v3.0 `file_of` has each episode's file."""
+    shared = version == "v3.0"
+    data_path, video_path = PATHS["v3.0" if shared else "v2.0"]
     described = {
         "observation.state": {"dtype": "float32", "shape": [2], "names": ["a", "b"]},
         "action": {"dtype": "float32", "shape": [3], "names": [["x", "y", "gripper"]]},
-        key: {"dtype": "image" if image else "video", "shape": [48, 64, 3], "names": None},
+        VIEW_KEY: {"dtype": "image" if image else "video", "shape": [48, 64, 3], "names": None},
         "timestamp": {"dtype": "float32", "shape": [1], "names": None},
         **(features or {}),
     }
-    described = {name: feature for name, feature in described.items() if feature}
     info = {
         "codebase_version": version,
         "fps": 10,
         "chunks_size": 1000,
-        "features": described,
-        "data_path": DATA_PATHS["v3.0" if v3 else "v2.0"],
-        "video_path": VIDEO_PATHS["v3.0" if v3 else "v2.0"],
+        "features": {name: feature for name, feature in described.items() if feature},
+        "data_path": data_path,
+        "video_path": video_path,
     }
     (root / "meta").mkdir(parents=True)
     (root / "meta/info.json").write_text(json.dumps(info))
-    texts = {"place": 7, "pick": 3}
-    tables, first = [], 0
+    rng, starts, tables = np.random.default_rng(1), np.cumsum([0, *lengths]), []
     for index, length in enumerate(lengths):
-        frames = np.arange(first, first + length)
+        frames = starts[index] + np.arange(length)
         rows = {
             "observation.state": list(rng.normal(size=(length, 2)).astype(np.float32)),
             "action": list(rng.normal(size=(length, 3)).astype(np.float32)),
@@ -239,103 +249,68 @@ def write_lerobot(
             "frame_index": np.arange(length),
             "episode_index": np.full(length, index),
             "index": frames,
-            "task_index": np.full(length, texts[tasks[index]]),
+            "task_index": np.full(length, TASKS[tasks[index]]),
         }
         if image:
-            rows[key] = [{"bytes": png(shade_of(f)), "path": None} for f in frames]
+            rows[VIEW_KEY] = [{"bytes": png(shade_of(frame)), "path": None} for frame in frames]
         rows |= columns
-        tables.append(pa.table({k: v for k, v in rows.items() if v is not None}))
-        first += length
-    starts = np.cumsum([0, *lengths])
-    if v3:
-        _write_v3(root, tables, starts, image, group, file_of, tasks, texts, key)
-    else:
-        _write_v2(root, tables, starts, image, group, tasks, texts, key)
+        tables.append(pa.table({name: v for name, v in rows.items() if v is not None}))
+    files = (file_of or [0] * len(lengths)) if shared else range(len(lengths))
+    for file in {*files}:
+        members = [index for index, of in enumerate(files) if of == file]
+        place = {"chunk_index": 0, "file_index": file, "episode_chunk": 0, "episode_index": file}
+        path = root / data_path.format(**place)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        pq.write_table(pa.concat_tables([tables[index] for index in members]), path, 6)
+        if not image:
+            spans = [range(starts[index], starts[index + 1]) for index in members]
+            shades = [shade_of(frame) for span in spans for frame in span]
+            write_video(root / video_path.format(video_key=VIEW_KEY, **place), shades)
+    episodes: list[dict[str, Any]] = [
+        {"episode_index": index, "tasks": [tasks[index]], "length": length}
+        for index, length in enumerate(lengths)
+    ]
+    if not shared:
+        rows = [{"task_index": index, "task": text} for text, index in TASKS.items()]
+        write_jsonl(root / "meta/episodes.jsonl", episodes)
+        write_jsonl(root / "meta/tasks.jsonl", rows)
+        return root
+    for index, (row, file) in enumerate(zip(episodes, files, strict=True)):
+        first = starts[min(i for i, of in enumerate(files) if of == file)]
+        row |= {"data/chunk_index": 0, "data/file_index": file, "stats/action/min": [0.0]}
+        row |= {"dataset_from_index": starts[index], "dataset_to_index": starts[index + 1]}
+        if not image:  # spans are inexact sums, as LeRobot's own
+            span = {"chunk_index": 0, "file_index": file}
+            span["from_timestamp"] = float(starts[index] - first) * 0.1
+            span["to_timestamp"] = float(starts[index + 1] - first) * 0.1
+            row |= {f"videos/{VIEW_KEY}/{name}": value for name, value in span.items()}
+    (root / EPISODES_V3).parent.mkdir(parents=True)
+    pq.write_table(pa.Table.from_pylist(episodes), root / EPISODES_V3)
+    named = pa.table({"task_index": [*TASKS.values()], "__index_level_0__": [*TASKS]})
+    pq.write_table(named, root / "meta/tasks.parquet")
     return root
 
 
-def _write_v2(
-    root: Path,
-    tables: Sequence[pa.Table],
-    starts: np.ndarray,
-    image: bool,
-    group: int,
-    tasks: Sequence[str],
-    texts: Mapping[str, int],
-    key: str,
-) -> None:
-    episodes = []
-    for index, table in enumerate(tables):
-        place = {"episode_chunk": 0, "episode_index": index}
-        path = root / DATA_PATHS["v2.0"].format(**place)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        pq.write_table(table, path)
-        if not image:
-            shades = [shade_of(f) for f in range(starts[index], starts[index + 1])]
-            write_video(
-                root / VIDEO_PATHS["v2.0"].format(video_key=key, **place), shades, 10, group=group
-            )
-        episodes.append({"episode_index": index, "tasks": [tasks[index]], "length": table.num_rows})
-    write_jsonl(root / "meta/episodes.jsonl", episodes)
-    write_jsonl(
-        root / "meta/tasks.jsonl", [{"task_index": i, "task": text} for text, i in texts.items()]
-    )
-
-
-def _write_v3(
-    root: Path,
-    tables: Sequence[pa.Table],
-    starts: np.ndarray,
-    image: bool,
-    group: int,
-    file_of: Sequence[int] | None,
-    tasks: Sequence[str],
-    texts: Mapping[str, int],
-    key: str,
-) -> None:
-    files = file_of or [0] * len(tables)
-    rows: list[dict[str, Any]] = []
-    for file in sorted(set(files)):
-        members = [i for i, f in enumerate(files) if f == file]
-        path = root / DATA_PATHS["v3.0"].format(chunk_index=0, file_index=file)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        pq.write_table(pa.concat_tables([tables[i] for i in members]), path, row_group_size=6)
-        shades = [shade_of(f) for i in members for f in range(starts[i], starts[i + 1])]
-        if not image:
-            place = {"video_key": key, "chunk_index": 0, "file_index": file}
-            write_video(root / VIDEO_PATHS["v3.0"].format(**place), shades, 10, group=group)
-        origin = starts[members[0]]
-        for i in members:
-            row: dict[str, Any] = {
-                "episode_index": i,
-                "length": tables[i].num_rows,
-                "tasks": [tasks[i]],
-                "data/chunk_index": 0,
-                "data/file_index": file,
-                "dataset_from_index": int(starts[i]),
-                "dataset_to_index": int(starts[i + 1]),
-                "stats/action/min": [0.0],
-            }
-            if not image:
-                row |= {
-                    f"videos/{key}/chunk_index": 0,
-                    f"videos/{key}/file_index": file,
-                    # An inexact sum, as LeRobot's own.
-                    f"videos/{key}/from_timestamp": float(starts[i] - origin) * 0.1,
-                    f"videos/{key}/to_timestamp": float(starts[i + 1] - origin) * 0.1,
-                }
-            rows.append(row)
-    path = root / "meta/episodes/chunk-000/file-000.parquet"
-    path.parent.mkdir(parents=True)
-    pq.write_table(pa.Table.from_pylist(rows), path)
-    pq.write_table(
-        pa.table({"task_index": list(texts.values()), "__index_level_0__": list(texts)}),
-        root / "meta/tasks.parquet",
-    )
+def edit_v3(root: Path, **columns: Any) -> None:
+    """Replace or add columns of `meta/episodes` of v3.0; None drops one."""
+    table = pq.ParquetFile(root / EPISODES_V3).read()
+    for name, cells in columns.items():
+        table = table.drop_columns([name] if name in table.column_names else [])
+        if cells is not None:
+            table = table.append_column(name, pa.array(cells))
+    pq.write_table(table, root / EPISODES_V3)
 
 
 def write_jsonl(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
     path.write_text("".join(json.dumps(row) + "\n" for row in rows))
+
+
+def open_all(
+    folder: Path, views: Sequence[str] | None = None, **entries: Any
+) -> tuple[Recording, ...]:
+    """The recordings of the source with these entries, by default that at `folder`."""
+    entries = {"name": "s", "path": str(folder), **entries}
+    return open_recordings([Source(**entries)], folder, views).recordings
 
 
 def edit_json(path: Path, **changes: Any) -> None:

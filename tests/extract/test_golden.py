@@ -9,7 +9,7 @@ import zarr
 from PIL import Image
 
 from pipeline.base.config import Params
-from pipeline.data.row_range import RowRange
+from pipeline.data.episode import RowRange
 from pipeline.extract import extract
 from pipeline.extract.repair import repair
 from pipeline.store import FeatureStore, StoreBuild

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.data.row_range import by_episode
+from pipeline.data.episode import by_episode
 from pipeline.extract.cluster import PAGE_BYTES, ranges_of, rows_between_pages
 
 

@@ -23,9 +23,8 @@ from pipeline.store import FeatureStore
 from pipeline.store.chunks import write_seal
 from stages.command import run
 from stages.extract import main
-from tests.data.conftest import START, Truth, edit_json, write_new, write_raw
+from tests.data.conftest import START, Truth, edit_json, edit_v3, write_new, write_raw
 from tests.data.conftest import write_lerobot as write_small_lerobot
-from tests.data.test_lerobot import edit_v3
 
 ROOT = Path(__file__).resolve().parents[2]
 

@@ -10,7 +10,8 @@ import pytest
 import zarr
 
 from pipeline.base.config import TrainHeadParams
-from pipeline.store import Batch, FeatureStore
+from pipeline.store import FeatureStore
+from pipeline.store.batch import Batch
 from pipeline.store.chunks import write_seal
 from pipeline.train.batches import BatchIndices
 from pipeline.train.loop import Trainer

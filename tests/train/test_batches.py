@@ -12,7 +12,8 @@ import pytest
 import torch
 
 from pipeline.base.config import TrainHeadParams
-from pipeline.store import Batch, FeatureStore
+from pipeline.store import FeatureStore
+from pipeline.store.batch import Batch
 from pipeline.train.batches import BatchIndices, Lags, Prefetch, Windows, cut_batches, evenly
 
 CPU = torch.device("cpu")

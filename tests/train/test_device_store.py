@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 import torch
 
-from pipeline.store import Batch, FeatureStore
+from pipeline.store import FeatureStore
+from pipeline.store.batch import Batch
 from pipeline.store.gather import WIDE
 from pipeline.train.batches import (
     BatchIndices,

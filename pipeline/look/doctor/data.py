@@ -10,7 +10,8 @@ from pipeline.base.commands import command
 from pipeline.base.config import MediaLimits, Params, Source
 from pipeline.base.errors import Issue, RecordingError
 from pipeline.data import Opened, Recording, open_recordings
-from pipeline.data.media import DEFAULT_LIMITS, opened_video
+from pipeline.data.recording import DEFAULT_LIMITS
+from pipeline.data.video import opened_video
 from pipeline.look.doctor import missing, note, ok
 
 _WHEEL = "pip install --upgrade --force-reinstall --only-binary av av"

@@ -16,9 +16,10 @@ import torch
 from numpy.typing import NDArray
 
 from pipeline.data import Recording
-from pipeline.data.row_range import RowFrames, by_episode
+from pipeline.data.episode import RowFrames, by_episode
 from pipeline.policy.observation import LiveObservation
-from pipeline.store import Batch, FeatureStore
+from pipeline.store import FeatureStore
+from pipeline.store.batch import Batch
 from pipeline.train.batches import BatchIndices, Prefetch, Windows
 from pipeline.vlm.preparation import PreparedRow, Preparer
 

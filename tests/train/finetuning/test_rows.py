@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from pipeline.base.config import Params
 from pipeline.base.errors import RecordingError
-from pipeline.data.row_range import by_episode
+from pipeline.data.episode import by_episode
 from pipeline.extract import extract
 from pipeline.simulation.insertion_formats import write_lerobot
 from pipeline.simulation.recorder import simulate_episode
