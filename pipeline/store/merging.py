@@ -26,12 +26,16 @@ from pipeline.base.errors import ConfigError, StoreMismatch
 from pipeline.base.golden import spread
 from pipeline.base.source import RATE_TOLERANCE
 from pipeline.base.tuned_on import joined, of_store, store_attributes
-from pipeline.store.chunks import check_row_checksums, check_trailers, read_rows
+from pipeline.store.chunks import (
+    METADATA_DIGEST,
+    SEAL,
+    check_row_checksums,
+    check_trailers,
+    read_rows,
+)
 from pipeline.store.episodes import Episode, index_arrays
 from pipeline.store.golden import GOLDEN, GoldenFrames, read_golden
 from pipeline.store.lock import build_lock
-from pipeline.store.metadata import ATTRIBUTE as METADATA_DIGEST
-from pipeline.store.metadata import SEAL
 from pipeline.store.paths import (
     MERGED,
     Inode,

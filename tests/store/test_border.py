@@ -16,8 +16,7 @@ import zarr
 from pipeline.base.errors import PipelineError, StoreIncomplete
 from pipeline.store import FeatureStore, RowSource, part_path
 from pipeline.store.archive import archive, restore
-from pipeline.store.chunks import write_seal
-from pipeline.store.metadata import note_metadata
+from pipeline.store.chunks import note_metadata, write_seal
 from pipeline.store.schema import read_spec
 from pipeline.store.verification import verify
 

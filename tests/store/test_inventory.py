@@ -14,6 +14,7 @@ from pipeline.base.errors import ConfigError, StoreLocked
 from pipeline.base.files import HELD, MARKER, begin_folder, mark
 from pipeline.store import FeatureStore, StoreBuild, build_lock
 from pipeline.store.archive import archive
+from pipeline.store.chunks import note_metadata
 from pipeline.store.inventory import (
     StoreEntry,
     describe_kept,
@@ -23,7 +24,6 @@ from pipeline.store.inventory import (
     list_stores,
     remove_entry,
 )
-from pipeline.store.metadata import note_metadata
 from pipeline.store.paths import (
     KEPT,
     STORE,

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
+from pipeline.store.border import mend, restore_command, start_over
 from pipeline.store.paths import read_plan
-from pipeline.store.repair_hints import mend, restore_command, start_over
 
 
 @pytest.mark.parametrize("inside", ["", "zarr.json", "vl/features/c/0/0/0"])
