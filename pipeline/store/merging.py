@@ -234,8 +234,8 @@ def _checked_output(inputs: Sequence[Path], output: Path | None) -> Path:
 def _check_free(output: Path, plan: str) -> None:
     """Raise `StoreMismatch` where the output's place holds another store or build."""
     plans = {output: {read_plan(output)}, part_path(output): {*unfinished_plans(output)}}
-    for place, found in plans.items():
-        if found - {None, plan}:
+    for place, present in plans.items():
+        if present - {None, plan}:
             raise StoreMismatch(
                 f"{place}: expected nothing there, or a merge of these very stores; found another. "
                 "Choose another name with --into, or remove it."

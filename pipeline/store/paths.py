@@ -232,13 +232,13 @@ def find_attributes(root: Path) -> dict[str, Any]:
     if "schema" not in attributes:
         part = root if build else part_path(root)
         target = root.with_name(root.name.removesuffix(".part"))
-        found, then = "nothing there", f"Run {extract_command(target)}."
+        actual, then = "nothing there", f"Run {extract_command(target)}."
         if part.exists():
-            found = f"only the unfinished build {part}"
+            actual = f"only the unfinished build {part}"
         elif there(root):
-            found = f"{described(root)} and no zarr.json that says so"
+            actual = f"{described(root)} and no zarr.json that says so"
             then = f"It was left as it is: name another place, or, if it was one, {mend(root)}"
-        raise StoreIncomplete(f"{root}: no finished store, found {found}. {then}")
+        raise StoreIncomplete(f"{root}: no finished store, found {actual}. {then}")
     if attributes["schema"] != SCHEMA:
         raise StoreMismatch(
             f"{root / 'zarr.json'}: expected store schema {SCHEMA}, found "

@@ -194,11 +194,9 @@ class TestArchive:
             archive(originals / "s.zarr", tmp_path / "second.zarr", level=1, threads=1)
         assert not list(tmp_path.glob("second.zarr*/"))
 
-    def test_from_and_to_a_disk_that_cannot_be_written(self, originals, small_disk, tmp_path):
-        store, output = (
-            shutil.copytree(originals / name, small_disk / name)
-            for name in ("s.zarr", "s.archive.zarr")
-        )
+    def test_from_a_disk_that_cannot_be_written(self, originals, small_disk, tmp_path):
+        names = ("s.zarr", "s.archive.zarr")
+        store, output = (shutil.copytree(originals / name, small_disk / name) for name in names)
         subprocess.run(["mount", "-o", "remount,ro", str(small_disk)], check=True)
         archive(store, tmp_path / "a.zarr", level=1, threads=2)
         restore(output, tmp_path / "back.zarr", threads=2)

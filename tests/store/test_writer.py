@@ -16,7 +16,7 @@ import zarr
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from pipeline.base.errors import ConfigError, DiskFull, StoreIncomplete, StoreLocked
+from pipeline.base.errors import ConfigError, StoreIncomplete, StoreLocked
 from pipeline.store import (
     FeatureStore,
     RowSource,
@@ -341,29 +341,6 @@ class TestLinks:
         lay_out(build)
         build.commit([0], np.zeros((1, 1, 2), np.float32), [bytes(16)], 0)
         return build
-
-
-class TestDiskFull:
-    def test_a_full_disk_is_named_and_the_build_resumes(self, small_disk):
-        build = begun(small_disk)
-        features = rows_of(0, ROWS)
-        keys = [bytes([i] * 16) for i in range(ROWS)]
-        build.commit(range(4), features[:4], keys[:4], build.environment_index({"torch": "1"}))
-        ballast_path = small_disk / "ballast"
-        with pytest.raises(OSError, match="No space"), ballast_path.open("wb") as ballast:
-            while True:
-                ballast.write(bytes(4096))
-                ballast.flush()
-        with pytest.raises(DiskFull, match=r"no space left.*make room"):
-            other = StoreBuild(small_disk / "other.zarr", build.specs, "plan")
-            other.create()
-            other.allocate()
-        ballast_path.unlink()
-        again = resumed(build)
-        assert again.missing().tolist() == list(range(4, ROWS))
-        again.commit(range(4, ROWS), features[4:], keys[4:], 0)
-        again.seal()
-        assert np.array_equal(FeatureStore.open(again.target).array(FEATURES), features)
 
 
 class TestLock:
