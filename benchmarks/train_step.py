@@ -23,8 +23,7 @@ from benchmarks.timing import Work, arguments, at_least, at_most, race, report
 from pipeline.base.config import TrainHeadParams, load_params
 from pipeline.policy.cost import flop_table
 from pipeline.store import FeatureStore
-from pipeline.store.batch import Batch
-from pipeline.store.gather import WIDE
+from pipeline.store.gather import WIDE, Batch
 from pipeline.train.batches import BatchIndices, Prefetch, Windows
 from pipeline.train.feature_source import FeatureSource
 from pipeline.train.loop import Trainer

@@ -22,8 +22,7 @@ from pipeline.base.errors import Issue, StoreIncomplete
 from pipeline.base.files import disk_full_named, sync
 from pipeline.base.source import row_key
 from pipeline.store.border import FrameDocument, StoreAttributes, StoredGolden, store_border
-from pipeline.store.chunks import read_rows
-from pipeline.store.metadata import check_metadata, note_metadata
+from pipeline.store.chunks import check_metadata, note_metadata, read_rows
 from pipeline.store.paths import group_attributes, laid_out_attributes
 from pipeline.store.schema import TRAILER_BYTES, ArraySpec
 

@@ -30,12 +30,16 @@ from pipeline.base.source import (
     tuned_on_attributes,
     tuned_on_of_store,
 )
-from pipeline.store.chunks import check_row_checksums, check_trailers, read_rows
+from pipeline.store.chunks import (
+    METADATA_DIGEST,
+    SEAL,
+    check_row_checksums,
+    check_trailers,
+    read_rows,
+)
 from pipeline.store.episodes import Episode, index_arrays
 from pipeline.store.golden import GOLDEN, GoldenFrames, read_golden
 from pipeline.store.lock import build_lock
-from pipeline.store.metadata import ATTRIBUTE as METADATA_DIGEST
-from pipeline.store.metadata import SEAL
 from pipeline.store.paths import (
     MERGED,
     Inode,
@@ -234,8 +238,8 @@ def _checked_output(inputs: Sequence[Path], output: Path | None) -> Path:
 def _check_free(output: Path, plan: str) -> None:
     """Raise `StoreMismatch` where the output's place holds another store or build."""
     plans = {output: {read_plan(output)}, part_path(output): {*unfinished_plans(output)}}
-    for place, found in plans.items():
-        if found - {None, plan}:
+    for place, present in plans.items():
+        if present - {None, plan}:
             raise StoreMismatch(
                 f"{place}: expected nothing there, or a merge of these very stores; found another. "
                 "Choose another name with --into, or remove it."

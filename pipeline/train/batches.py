@@ -24,8 +24,7 @@ from pipeline.base.config import TrainHeadParams
 from pipeline.base.machine import available_bytes
 from pipeline.base.text import size
 from pipeline.store import FeatureStore
-from pipeline.store.batch import Batch
-from pipeline.store.gather import WIDE, Index, Late, Selection, Window
+from pipeline.store.gather import WIDE, Batch, Index, Late, Selection, Window
 from pipeline.store.mapping import fitting
 
 Ticks = NDArray[np.int64]

@@ -26,7 +26,7 @@ from pipeline.datasets import (
     unified_collate_fn,
 )
 from pipeline.store import FeatureStore
-from pipeline.store.batch import Batch
+from pipeline.store.gather import Batch
 from pipeline.train.split import split_by_episode
 
 SMALL = TrainHeadParams.model_validate(

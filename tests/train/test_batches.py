@@ -13,7 +13,7 @@ import torch
 
 from pipeline.base.config import TrainHeadParams
 from pipeline.store import FeatureStore
-from pipeline.store.batch import Batch
+from pipeline.store.gather import Batch
 from pipeline.train.batches import BatchIndices, Lags, Prefetch, Windows, cut_batches, evenly
 
 CPU = torch.device("cpu")

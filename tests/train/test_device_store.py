@@ -10,8 +10,7 @@ import pytest
 import torch
 
 from pipeline.store import FeatureStore
-from pipeline.store.batch import Batch
-from pipeline.store.gather import WIDE
+from pipeline.store.gather import WIDE, Batch
 from pipeline.train.batches import (
     BatchIndices,
     DeviceStore,
