@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from transformers import AutoImageProcessor
 
 from pipeline.base.errors import VLMError
-from pipeline.vlm.extractor import patchify
 from pipeline.vlm.processor import PixelSettings, stretch
+from pipeline.vlm.qwen import patchify
 
 
 def test_the_seeds_resize_gives_364_by_644(demo_checkpoint: Path) -> None:

@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 from transformers import Qwen2_5_VLForConditionalGeneration
 
-from pipeline.vlm.extractor import Extractor, patchify
 from pipeline.vlm.processor import PixelSettings
+from pipeline.vlm.qwen import Extractor, patchify
 from pipeline.vlm.vision import VisionTower
 
 CPU = torch.device("cpu")
