@@ -15,17 +15,17 @@ from torch.profiler import ProfilerActivity, profile
 from benchmarks.timing import Work
 from pipeline.data.episode import RowRange
 from pipeline.store import StoreBuild
-from pipeline.vlm.extractor import Extractor
+from pipeline.vlm.qwen import Extractor
 from pipeline.vlm.vision import VisionTower
 
 _STEPS: tuple[tuple[str, Any, str], ...] = (
     ("key", "pipeline.base.source", "row_key"),
     ("resize", "pipeline.vlm.preparation", "stretch"),
     ("collate", Extractor, "collate"),
-    ("patchify", "pipeline.vlm.extractor", "patchify"),
+    ("patchify", "pipeline.vlm.qwen", "patchify"),
     ("vision tower", VisionTower, "__call__"),
     ("decoder", Extractor, "_read"),
-    ("pooling", "pipeline.vlm.extractor", "pool"),
+    ("pooling", "pipeline.vlm.qwen", "pool"),
     ("write", StoreBuild, "write_features"),
     ("mark", StoreBuild, "mark"),
 )

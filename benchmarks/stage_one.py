@@ -44,14 +44,14 @@ class StageOne:
         """Fill the store."""
         work = self._workload
         extract = work.params.extract.model_copy(update={"batch_size": self.batch_size})
-        params = work.params.model_copy(update={"extract": extract})
-        surveyed = replace(work.survey, params=params)
+        surveyed = replace(work.survey, extract=extract)
         # Stage one takes the model that is there instead of loading it again.
         with patch.object(FrozenVLM, "load", return_value=self._vlm):
             done = fill(self._build, surveyed, [], work.digests, work.missing, compute_here)
         assert done.computed + done.repeated == len(work.missing), done
-        assert done.model_share is not None and done.waited_share is not None
-        self.shares.append((done.model_share, done.waited_share))
+        _, model, waited = done.speed
+        assert model is not None and waited is not None
+        self.shares.append((model, waited))
 
     def features(self) -> NDArray[np.float32]:
         """Features (row, dim) of the last run."""

@@ -17,7 +17,7 @@ from pipeline.base.digests import ContentDigests
 from pipeline.data.episode import RowFrames, RowRange
 from pipeline.extract.engine import RANGE_ROWS
 from pipeline.extract.layout import build_arrays, finish_layout, lay_out
-from pipeline.extract.survey import CheckedEpisode, Survey, check_episodes, survey
+from pipeline.extract.survey import CheckedEpisode, Survey, sound_episodes, survey
 from pipeline.simulation.demo_recordings import TASK
 from pipeline.simulation.insertion_formats import write_raw
 from pipeline.simulation.recorder import simulate_episode
@@ -48,9 +48,7 @@ class Workload:
     @classmethod
     def of(cls, params: Params, rows: int, digests: ContentDigests) -> "Workload":
         """The first `rows` VL rows of the recordings of `params`."""
-        surveyed = survey(params, digests)
-        checked, bad = check_episodes(surveyed)
-        assert not bad, bad
+        surveyed, checked = sound_episodes(survey(params, digests), digests)
         with closing(_laid_out(surveyed, checked)) as build:
             vl_start, frame_time = (
                 build.files(name).read(0, build.specs[name].shape[0])

@@ -46,10 +46,11 @@ def main(params: "Params") -> None:
             f"{store}: {report.rows} rows, {report.computed} computed ({rate:.1f} rows/s), "
             f"{report.taken} taken over, {report.repeated} equal to another"
         )
-        if report.model_share is not None and report.waited_share is not None:
+        speed = report.speed
+        if speed.model_share is not None and speed.waited_share is not None:
             print(
-                f"the model worked {report.model_share:.0%} of the time and waited "
-                f"{report.waited_share:.0%} for frames"
+                f"the model worked {speed.model_share:.0%} of the time and waited "
+                f"{speed.waited_share:.0%} for frames"
             )
 
 

@@ -119,7 +119,9 @@ class QwenVLAUnified(LivePolicy[LiveVLM]):
         a checkpoint's policy was trained on other features.
         """
         if policy.feature_spec is not None:
-            vlm.refuse_other_features(policy.feature_spec)
+            from pipeline.vlm.live import refuse_other_features
+
+            refuse_other_features(vlm.vlm, policy.feature_spec, vlm.spec)
         model = cls.__new__(cls)
         model._assemble(policy, vlm.vlm, vlm.tuning, vlm.spec.views)
         vlm.check_shape(policy.shape.slots, policy.shape.feature_dim)

@@ -115,7 +115,7 @@ class ExtractionPlugin(WorkerPlugin):
     @property
     def local(self) -> bool:
         """Whether all workers are on the coordinator's host."""
-        return isinstance(self.surveyed.params.extract.workers, int)
+        return isinstance(self.surveyed.extract.workers, int)
 
     def setup(self, worker: Worker) -> None:
         """Open nothing yet: the first task does, so that a failure there is that task's error."""
@@ -156,8 +156,8 @@ class ExtractionPlugin(WorkerPlugin):
                 "to a folder of a file system that all hosts share."
             )
         if not self.local:
-            params, spec = surveyed.params, surveyed.spec
-            ours = feature_spec(params.vlm, params.extract.dtype, spec.views, file_digest)
+            vlm, dtype, spec = surveyed.vlm, surveyed.extract.dtype, surveyed.spec
+            ours = feature_spec(vlm, dtype, spec.views, file_digest)
             if ours.digest != spec.digest:
                 lines = "; ".join(describe(differences(ours.attrs(), spec.attrs())))
                 raise ConfigError(
@@ -171,7 +171,7 @@ class ExtractionPlugin(WorkerPlugin):
 
         dask-cuda and CUDA_VISIBLE_DEVICES show each of those workers its own GPU first.
         """
-        wanted, devices = self.surveyed.params.extract.device, torch.cuda.device_count()
+        wanted, devices = self.surveyed.extract.device, torch.cuda.device_count()
         turns = wanted in ("auto", "cuda") and devices > 1
         if self.local and isinstance(worker_name, int) and turns:
             return f"cuda:{worker_name % devices}"
@@ -215,7 +215,7 @@ def compute_on_cluster(
     all workers are lost. Raises `RecordingError` after all other rows where some could not be
     computed.
     """
-    extract, array = surveyed.params.extract, marks.build.specs[FEATURES]
+    extract, array = surveyed.extract, marks.build.specs[FEATURES]
     plugin = ExtractionPlugin(surveyed, [source.path for source in known])
     rows = _AUTO_RANGE_ROWS if extract.batch_size == "auto" else extract.batch_size
     most = max(1, rows // surveyed.spec.variants)
@@ -249,7 +249,7 @@ class ClusterTasks:
     def results(self, ranges: Iterable[Range]) -> Generator[list[WrittenRows]]:
         """The rows that workers wrote; raises one error at the end for those that failed."""
         given_up: list[Range] = []
-        for done in self._completed(ranges, self._plugin.surveyed.params.extract.retries):
+        for done in self._completed(ranges, self._plugin.surveyed.extract.retries):
             written = [block for _, result in done if isinstance(result, list) for block in result]
             self._any_written |= bool(written)
             yield written

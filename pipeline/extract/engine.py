@@ -13,7 +13,6 @@ from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from functools import partial
 from itertools import chain, islice
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import numpy as np
@@ -76,20 +75,15 @@ Executor = Callable[
 
 @dataclass(frozen=True)
 class ExtractionReport:
-    """What was done.
+    """What was done: `taken` rows come from an earlier store or build, `repeated` rows equal a
+    `computed` row."""
 
-    `taken` rows come from an earlier store or build; `repeated` rows equal a `computed` row. The
-    shares are those of `Speed`.
-    """
-
-    store: Path
     rows: int
     taken: int
     computed: int
     repeated: int
     seconds: float
-    model_share: float | None
-    waited_share: float | None
+    speed: Speed
 
 
 def fill(
@@ -118,14 +112,12 @@ def fill(
     if speed.rows_per_s is not None:
         digests.note_rate(surveyed.rate_name, speed.rows_per_s)
     return ExtractionReport(
-        store=build.target,
         rows=total,
         taken=marks.counts["known"],
         computed=marks.counts["computed"],
         repeated=marks.counts["repeated"],
         seconds=time.monotonic() - begun,
-        model_share=speed.model_share,
-        waited_share=speed.waited_share,
+        speed=speed,
     )
 
 
@@ -211,10 +203,10 @@ class RowEngine:
             from pipeline.extract.encoder import Encoder
             from pipeline.vlm.qwen import FrozenVLM
 
-            params, spec = self._surveyed.params, self._surveyed.spec
-            vlm = FrozenVLM.load(params.vlm, spec, self._device, params.extract.compile)
+            extract, spec = self._surveyed.extract, self._surveyed.spec
+            vlm = FrozenVLM.load(self._surveyed.vlm, spec, self._device, extract.compile)
             self._environment = vlm.environment
-            self.encoder = Encoder(vlm, params.extract.batch_size, spec.variants)
+            self.encoder = Encoder(vlm, extract.batch_size, spec.variants)
             self._loaded_at = time.monotonic()
         return self.encoder
 
@@ -227,7 +219,7 @@ def compute_here(
     marks: RowMarks,
 ) -> Speed:
     """The executor of this process: threads prepare, the caller's encodes, another commits."""
-    extract = surveyed.params.extract
+    extract = surveyed.extract
     engine = RowEngine(surveyed, frames, known, extract.device)
 
     def ranges_ahead() -> int:

@@ -18,7 +18,7 @@ from pipeline.base.source import tuned_on_attributes
 from pipeline.base.text import size
 from pipeline.data import Stream
 from pipeline.data.timeline import Timeline, tick_hz
-from pipeline.extract.plan import store_bytes
+from pipeline.extract.state import store_bytes
 from pipeline.extract.survey import CheckedEpisode, Survey, embodiment_of
 from pipeline.store import SCHEMA, RowSource, Sizes, StoreBuild, arrays
 from pipeline.store.border import StoreAttributes
@@ -75,7 +75,7 @@ def lay_out(
     for source, name, rows in _linkable(build, checked, known):
         build.link_unchanged(name, source.path, source.specs[name], rows)
     build.allocate()
-    sources = [source.name for source in survey.params.data.sources]
+    sources = [source.name for source in survey.data.sources]
     for name, values in episode_arrays(checked, sources, survey.spec.views).items():
         build.write(name, 0, values)
     valid = [_slot_valid(episode.ticks, survey.spec) for episode in checked]
@@ -93,7 +93,7 @@ def finish_layout(build: StoreBuild, checked: Sequence[CheckedEpisode], survey: 
 
 def build_arrays(checked: Sequence[CheckedEpisode], survey: Survey) -> dict[str, ArraySpec]:
     """The arrays that these episodes need."""
-    embodiment, extract = embodiment_of(checked), survey.params.extract
+    embodiment, extract = embodiment_of(checked), survey.extract
     count = Counter[str]()
     for episode in checked:
         count.update(episode.counts)
@@ -167,7 +167,7 @@ def _stored(stream: Stream, spec: ArraySpec) -> NDArray[Any]:
 
 
 def _attributes(checked: Sequence[CheckedEpisode], survey: Survey) -> dict[str, Any]:
-    data = survey.params.data
+    data = survey.data
     return {
         "schema": SCHEMA,
         "feature_spec": survey.spec.attrs(),
@@ -177,5 +177,5 @@ def _attributes(checked: Sequence[CheckedEpisode], survey: Survey) -> dict[str, 
         "action_hz": tick_hz((episode.ticks.recorded_hz for episode in checked), data.action_hz),
         "vlm_reuse_count": data.vlm_reuse_count,
         "environment": [],
-        **tuned_on_attributes(tuned_on(survey.params.vlm)),
+        **tuned_on_attributes(tuned_on(survey.vlm)),
     }

@@ -23,8 +23,8 @@ from pipeline.extract.rows import ReadyRow, RowPreparation
 from pipeline.extract.survey import survey
 from pipeline.store import FEATURES, FeatureStore
 from pipeline.store.writer import environment_runs
-from pipeline.vlm.deviation import slot_deviations, tolerance_of
 from pipeline.vlm.qwen import FrozenVLM
+from pipeline.vlm.slots import slot_deviations, tolerance_of
 
 
 @dataclass(frozen=True)

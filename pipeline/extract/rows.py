@@ -10,15 +10,20 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import groupby
 from operator import attrgetter
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
+from pipeline.base.source import spread
 from pipeline.data.episode import Frames, RowFrames, RowRange
+from pipeline.extract.state import Say
 from pipeline.extract.survey import Survey
-from pipeline.store import FEATURES, RowSource, StoreBuild
+from pipeline.store import FEATURES, GoldenFrames, RowSource, StoreBuild
+from pipeline.store.golden import carried_golden
+from pipeline.store.schema import KEYS
 from pipeline.vlm.preparation import PreparedRow, Preparer
 
 
@@ -62,7 +67,7 @@ class RowPreparation:
 
     def __init__(self, surveyed: Survey, known: Sequence[RowSource]) -> None:
         """Rows whose key is in `known` are taken from there."""
-        self._preparer = Preparer(surveyed.params.vlm, surveyed.spec)
+        self._preparer = Preparer(surveyed.vlm, surveyed.spec)
         self._spec = surveyed.spec
         self._known = known
         self._lock = threading.Lock()
@@ -163,3 +168,49 @@ def row_frames(build: StoreBuild, surveyed: Survey) -> RowFrames:
         for name in ("episode/vl_start", "vl/frame_time")
     )
     return RowFrames(surveyed.recordings, vl_start, frame_time, surveyed.spec.views)
+
+
+def keep_golden(build: StoreBuild, surveyed: Survey, stores: Sequence[Path], say: Say) -> None:
+    """Write the golden rows of a build that has all its rows: at most four, evenly spread.
+
+    Rows that one of `stores` has are copied from it, the others are decoded. A row is left out,
+    and `say` prints that, if its frames now decode to other pixels than when it was computed.
+    Raises `RecordingError` where a recording is gone, and `DiskFull`.
+    """
+    frames = row_frames(build, surveyed)
+    views = np.isfinite(frames.frame_time).sum(axis=1)
+    chosen = spread(np.arange(len(views)), views)
+    carried = _carried(build, surveyed, stores)
+    taken = [carried.pop(row) for row in chosen.tolist() if row in carried]
+    wanted = np.setdiff1d(chosen, [golden.row for golden in taken])
+    if left_out := build.write_golden([*taken, *_decoded(frames, wanted, surveyed)]):
+        say(
+            f"{left_out} golden row(s) left out: decoded today, their frames are other pixels than "
+            "those that the stored features were computed from (stages.verify --reextract tells "
+            "how far the features are apart)"
+        )
+
+
+def _carried(
+    build: StoreBuild, surveyed: Survey, stores: Sequence[Path]
+) -> dict[int, GoldenFrames]:
+    """The golden frames of these stores, by row.
+
+    A store under repair counts too: damaged frames do not give their key and are left out.
+    """
+    keys = build.files(KEYS).read(0, build.specs[KEYS].shape[0])
+    carried: dict[int, GoldenFrames] = {}
+    for store in stores:
+        for golden in carried_golden(store, surveyed.spec.attrs(), keys):
+            carried.setdefault(golden.row, golden)
+    return carried
+
+
+def _decoded(
+    frames: RowFrames, rows: NDArray[np.int64], surveyed: Survey
+) -> Iterator[GoldenFrames]:
+    preparer = Preparer(surveyed.vlm, surveyed.spec)
+    for part in frames.ranges(rows):
+        prompt = preparer.render(part.recording.instruction, list(part.frames))
+        for row, decoded in part.read():
+            yield GoldenFrames(row, prompt, decoded)

@@ -13,7 +13,6 @@ from pipeline.base.machine import resolve_device
 from pipeline.base.text import capped
 from pipeline.data.timeline import rate_notes
 from pipeline.extract.engine import Executor, ExtractionReport, compute_here, fill
-from pipeline.extract.golden import keep_golden
 from pipeline.extract.layout import (
     build_arrays,
     check_readable,
@@ -21,13 +20,12 @@ from pipeline.extract.layout import (
     finish_layout,
     lay_out,
 )
-from pipeline.extract.plan import count_known, plan_lines
-from pipeline.extract.state import Say, StorePlaces, row_sources
+from pipeline.extract.rows import keep_golden
+from pipeline.extract.state import Say, StorePlaces, count_known, plan_lines, row_sources
 from pipeline.extract.survey import (
     MOST_EPISODES,
     CheckedEpisode,
     Survey,
-    check_episodes,
     embodiment_of,
     sound_episodes,
     survey,
@@ -66,12 +64,13 @@ def extract(params: Params, say: Say) -> ExtractionReport | None:
             build = StoreBuild(target, build_arrays(checked, surveyed), surveyed.plan)
         with closing(build):
             rows = build.specs[FEATURES].shape[0]
-            missing = build.missing() if state == "resume" else np.arange(rows)
             if state == "resume":
+                missing = build.missing()
                 known = [RowSource(places.part)]
                 taken = rows - len(missing)
             else:
                 check_readable(build, checked, surveyed)
+                missing = np.arange(rows)
                 begun = [] if places.begun is None else [places.part]
                 known = row_sources([*begun, *places.known], surveyed)
                 taken = count_known(checked, surveyed, known)
@@ -81,17 +80,17 @@ def extract(params: Params, say: Say) -> ExtractionReport | None:
                 return None
             if state == "new":
                 check_space(build, checked, known)
-                if isinstance(params.extract.workers, str) and taken < rows:
+                if isinstance(surveyed.extract.workers, str) and taken < rows:
                     from pipeline.extract.cluster import check_scheduler  # dask: a second to import
 
-                    check_scheduler(params.extract.workers)
+                    check_scheduler(surveyed.extract.workers)
                 # From here on, no check refuses the run.
                 places = places.set_build_aside(surveyed, say)
                 lay_out(build, checked, surveyed, row_sources(places.known, surveyed))
                 finish_layout(build, checked, surveyed)
             known = row_sources(places.known, surveyed)
             report = fill(build, surveyed, known, digests, missing, _executor(surveyed))
-            keep_golden(build, surveyed, places, say)
+            keep_golden(build, surveyed, places.stores, say)
             places.put_in_place(build, surveyed, say)
         return report
 
@@ -124,7 +123,7 @@ def _survey(
     """The survey; for a new build also its sound episodes, each read completely."""
     surveyed = survey(params, digests)
     if surveyed.bad and params.data.on_bad_episode == "stop":
-        check_episodes(surveyed)  # lists them with everything else that is wrong
+        sound_episodes(surveyed, digests)  # lists them with everything else that is wrong
     state = places.state(surveyed.plan)
     if state != "current":
         resolve_device(params.extract.device)
@@ -133,7 +132,7 @@ def _survey(
 
 def _executor(surveyed: Survey) -> Executor:
     """The executor: this process, or the dask workers of `extract.workers`."""
-    if surveyed.params.extract.workers == 0:
+    if surveyed.extract.workers == 0:
         return compute_here
     from pipeline.extract.cluster import compute_on_cluster  # dask: a second to import
 
@@ -141,7 +140,7 @@ def _executor(surveyed: Survey) -> Executor:
 
 
 def _survey_lines(surveyed: Survey) -> Iterator[str]:
-    for source in surveyed.params.data.sources:
+    for source in surveyed.data.sources:
         for path in source.paths:
             if Path(path).is_absolute():
                 yield f"source {source.name!r}: {path} is absolute, so DVC does not watch it"
@@ -158,5 +157,5 @@ def _timeline_lines(surveyed: Survey, checked: Sequence[CheckedEpisode]) -> Iter
     if any(recording.has_poses for recording in surveyed.recordings):
         yield f"actions: rotations as {surveyed.action_rotation}"
     rates = [(ep.source, ep.ticks.recorded_hz, ep.ticks.fastest_hz) for ep in checked]
-    for source, note in rate_notes(rates, surveyed.params.data.action_hz).items():
+    for source, note in rate_notes(rates, surveyed.data.action_hz).items():
         yield f"source {source!r}: {note}"

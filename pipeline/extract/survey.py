@@ -1,7 +1,7 @@
 """Which episodes there are, what they hold, and whether each can be used.
 
 A survey reads no sensor and decodes no frame. Its plan digest covers everything that decides what a
-store holds: if a finished store has the same digest, there is nothing to do. `check_episodes` reads
+store holds: if a finished store has the same digest, there is nothing to do. `sound_episodes` reads
 every episode completely before the first byte is written, so that all faults are listed at once,
 before anything expensive runs.
 """
@@ -17,7 +17,7 @@ import numpy as np
 from tqdm import tqdm
 
 from pipeline.base.border import Border
-from pipeline.base.config import DataParams, Params
+from pipeline.base.config import DataParams, ExtractParams, Params, VLMParams
 from pipeline.base.digests import ContentDigests, joint_digest
 from pipeline.base.errors import RecordingError, StoreMismatch, VLMError
 from pipeline.base.source import RATE_TOLERANCE, Streams
@@ -70,7 +70,9 @@ class Survey:
     digest of everything that decides what the store holds.
     """
 
-    params: Params
+    data: DataParams
+    vlm: VLMParams
+    extract: ExtractParams
     episodes: tuple[SurveyedEpisode, ...]
     missing: tuple[str, ...]
     bad: tuple[BadEpisode, ...]
@@ -81,7 +83,7 @@ class Survey:
     @property
     def target(self) -> Path:
         """The store."""
-        return self.params.extract.store
+        return self.extract.store
 
     @property
     def recordings(self) -> list[Recording]:
@@ -99,10 +101,10 @@ class Survey:
 
         It leaves out what costs little time, such as the prompt, slots and names of views.
         """
-        extract, spec = self.params.extract, self.spec.attrs()
-        by = f" on {extract.workers}" if extract.workers != 0 else ""
+        spec, workers = self.spec.attrs(), self.extract.workers
+        by = f" on {workers}" if workers != 0 else ""
         deciding = {name: spec.get(name) for name in _DECIDES_SPEED} | {"views": len(spec["views"])}
-        return f"{joint_digest(json.dumps(deciding, sort_keys=True))} {extract.device}{by}"
+        return f"{joint_digest(json.dumps(deciding, sort_keys=True))} {self.extract.device}{by}"
 
 
 @dataclass(frozen=True)
@@ -120,7 +122,7 @@ def survey(params: Params, digests: ContentDigests) -> Survey:
     `RecordingError` when no episode is usable, and the error of a source that is refused as a
     whole.
     """
-    data = params.data
+    data, vlm, extract = params.data, params.vlm, params.extract
     opened = open_recordings(data.sources, data.root, data.views)
     rotation = choose_action_rotation(data.action_rotation, opened.recordings)
     episodes, bad = list[SurveyedEpisode](), list(opened.bad)
@@ -134,17 +136,21 @@ def survey(params: Params, digests: ContentDigests) -> Survey:
             bad.append(BadEpisode(recording.source, recording.path, str(error)))
     if not episodes:
         _refuse_bad(bad, total=len(bad))
-    spec, plan = _spec_and_plan(params, episodes, digests)
-    return Survey(params, tuple(episodes), opened.missing, tuple(bad), spec, rotation, plan)
+    spec, plan = _spec_and_plan(data, vlm, extract, episodes, digests)
+    found = tuple(episodes), opened.missing, tuple(bad)
+    return Survey(data, vlm, extract, *found, spec, rotation, plan)
 
 
 def _spec_and_plan(
-    params: Params, episodes: Sequence[SurveyedEpisode], digests: ContentDigests
+    data: DataParams,
+    vlm: VLMParams,
+    extract: ExtractParams,
+    episodes: Sequence[SurveyedEpisode],
+    digests: ContentDigests,
 ) -> tuple[FeatureSpec, str]:
     """The feature spec and the plan digest of a store of these episodes."""
-    data, extract = params.data, params.extract
     views = sorted({view for episode in episodes for view in episode.views})
-    spec = feature_spec(params.vlm, extract.dtype, views, digests.of, digests.text)
+    spec = feature_spec(vlm, extract.dtype, views, digests.of, digests.text)
     return spec, joint_digest(
         spec.digest,
         extract.sensor_dtype,
@@ -157,48 +163,36 @@ def _spec_and_plan(
 def sound_episodes(
     surveyed: Survey, digests: ContentDigests
 ) -> tuple[Survey, list[CheckedEpisode]]:
-    """The survey without the episodes that must be skipped, and every sound episode.
-
-    Raises as `check_episodes` does.
-    """
-    checked, failed = check_episodes(surveyed)
-    if not failed:
-        return surveyed, checked
-    for episode, bad in failed:
-        digests.note_bad(episode.digest, bad.reason)
-    unusable = {episode.digest for episode, _ in failed}
-    sound = [episode for episode in surveyed.episodes if episode.digest not in unusable]
-    spec, plan = _spec_and_plan(surveyed.params, sound, digests)
-    bad = (*surveyed.bad, *(bad for _, bad in failed))
-    reduced = replace(surveyed, episodes=tuple(sound), bad=bad, spec=spec, plan=plan)
-    return reduced, [episode for episode in checked if episode.fields["digest"] not in unusable]
-
-
-def check_episodes(
-    surveyed: Survey,
-) -> tuple[list[CheckedEpisode], list[tuple[SurveyedEpisode, BadEpisode]]]:
-    """Read and check every episode; returns the sound ones, and the others with the reason.
+    """Read and check every episode; returns the survey of the sound ones, and these.
 
     Raises one `RecordingError` that lists all unusable episodes, unless `data.on_bad_episode: skip`
     leaves them out, and `StoreMismatch` when two sources have different embodiments, or when
     `data.action_hz` is null and the episodes do not share one known rate.
     """
-    preparer = Preparer(surveyed.params.vlm, surveyed.spec)
-    sound: list[CheckedEpisode] = []
-    failed: list[tuple[SurveyedEpisode, BadEpisode]] = []
+    data, preparer = surveyed.data, Preparer(surveyed.vlm, surveyed.spec)
+    sound: list[SurveyedEpisode] = []
+    checked: list[CheckedEpisode] = []
+    failed: dict[str, BadEpisode] = {}
     for episode in tqdm(surveyed.episodes, "check", unit="episode", disable=None, leave=False):
         try:
-            sound.append(_checked(episode, surveyed, preparer))
+            checked.append(_checked(episode, data, surveyed.action_rotation, preparer))
+            sound.append(episode)
         except RecordingError as error:
             recording = episode.recording
-            failed.append((episode, BadEpisode(recording.source, recording.path, str(error))))
-    bad = [*surveyed.bad, *(bad for _, bad in failed)]
-    if bad and (surveyed.params.data.on_bad_episode == "stop" or not sound):
+            failed[episode.digest] = BadEpisode(recording.source, recording.path, str(error))
+    bad = (*surveyed.bad, *failed.values())
+    if bad and (data.on_bad_episode == "stop" or not sound):
         _refuse_bad(bad, total=len(sound) + len(bad))
-    embodiment_of(sound)
-    if surveyed.params.data.action_hz is None:
-        _refuse_rates(sound)
-    return sound, failed
+    embodiment_of(checked)
+    if data.action_hz is None:
+        _refuse_rates(checked)
+    if not failed:
+        return surveyed, checked
+    for digest, episode in failed.items():
+        digests.note_bad(digest, episode.reason)
+    spec, plan = _spec_and_plan(data, surveyed.vlm, surveyed.extract, sound, digests)
+    reduced = replace(surveyed, episodes=tuple(sound), bad=bad, spec=spec, plan=plan)
+    return reduced, checked
 
 
 def embodiment_of(checked: Sequence[CheckedEpisode]) -> Embodiment:
@@ -233,9 +227,11 @@ def _refuse_rates(checked: Sequence[CheckedEpisode]) -> None:
         )
 
 
-def _checked(episode: SurveyedEpisode, surveyed: Survey, preparer: Preparer) -> CheckedEpisode:
-    recording, data = episode.recording, surveyed.params.data
-    read = read_episode(recording, data.action_hz, data.vlm_reuse_count, surveyed.action_rotation)
+def _checked(
+    episode: SurveyedEpisode, data: DataParams, rotation: ActionRotation, preparer: Preparer
+) -> CheckedEpisode:
+    recording = episode.recording
+    read = read_episode(recording, data.action_hz, data.vlm_reuse_count, rotation)
     cameras = recording.cameras()
     try:
         preparer.render(recording.instruction, list(cameras))

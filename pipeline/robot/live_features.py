@@ -19,11 +19,10 @@ from pipeline.base.config import TuningParams, VLMParams
 from pipeline.base.errors import CheckpointMismatch
 from pipeline.base.source import row_key
 from pipeline.policy.checkpoint import PolicyCheckpoint
-from pipeline.vlm.deviation import slot_deviations, tolerance_of
 from pipeline.vlm.feature_spec import live_differences
 from pipeline.vlm.live import LiveVLM, live_spec, refuse_other_features
 from pipeline.vlm.preparation import Preparer
-from pipeline.vlm.slots import slot_name
+from pipeline.vlm.slots import slot_deviations, slot_name, tolerance_of
 
 _ROWS = 16
 """Frame sets in one pass of the model."""

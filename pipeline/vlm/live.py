@@ -1,5 +1,8 @@
 """The Qwen2.5-VL that learns: it computes features with gradients and saves its weights."""
 
+import re
+import shutil
+import warnings
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
@@ -7,18 +10,28 @@ from typing import Any
 
 import torch
 from jaxtyping import Bool, Float
+from safetensors.torch import load_file
 from torch import Tensor, nn
 
 from pipeline.base.config import TuningParams, VLMParams
 from pipeline.base.digests import file_digest
 from pipeline.base.errors import CheckpointMismatch, VLMError
+from pipeline.base.files import disk_full_named, sync, write_tensors
 from pipeline.base.machine import resolve_device
-from pipeline.vlm.extractor import Extractor, layers_needed
+from pipeline.base.text import capped
+from pipeline.vlm.checkpoint_folder import quiet_transformers, resolve_checkpoint
 from pipeline.vlm.feature_spec import FeatureSpec, feature_spec, live_differences
-from pipeline.vlm.loading import load_model
+from pipeline.vlm.loading import adapted, cut, load_checkpoint, load_model, load_whole
 from pipeline.vlm.preparation import PreparedRow
 from pipeline.vlm.processor import PixelSettings
-from pipeline.vlm.tuning import load_adapting, load_learning, save_adapter, save_checkpoint
+from pipeline.vlm.qwen import Extractor, layers_needed
+from pipeline.vlm.slots import Slot
+
+_TOWERS = {"language": "model.language_model.", "vision": "model.visual."}
+"""Prefix of each tower's names in a `Qwen2_5_VLForConditionalGeneration`."""
+
+_COMPANIONS = ("*config.json", "chat_template.*", "*token*.json", "vocab.json", "merges.txt")
+"""The files of a checkpoint folder besides its weights."""
 
 
 def live_spec(vlm: VLMParams, views: Sequence[str]) -> FeatureSpec:
@@ -29,20 +42,15 @@ def live_spec(vlm: VLMParams, views: Sequence[str]) -> FeatureSpec:
     return feature_spec(vlm, "float32", views, file_digest)
 
 
-_SHOWN = 8
-"""Entries of a feature spec that a message names."""
-
-
 def refuse_other_features(vlm: VLMParams, trained: Mapping[str, Any], live: FeatureSpec) -> None:
     """Raise `CheckpointMismatch` where features of the spec `trained` are not those of `live`.
 
     The error lists the entries of `live_differences`. No weight is loaded.
     """
     if lines := live_differences(trained, live.document):
-        more = [f"… and {len(lines) - _SHOWN} more"] if len(lines) > _SHOWN else []
         raise CheckpointMismatch(
             f"{vlm.checkpoint}: the policy was trained on other features than this model "
-            "gives (trained -> live):\n  " + "\n  ".join([*lines[:_SHOWN], *more]) + "\nLoad the "
+            "gives (trained -> live):\n  " + "\n  ".join(capped(lines, "entries")) + "\nLoad the "
             "model with the vlm params and views of the policy's store (slots follow from "
             "vlm.layers, norms, pooling and grid), or train on this model's features."
         )
@@ -100,9 +108,9 @@ class LiveVLM(nn.Module):
         if tuning.method == "none":
             model = inner = load_model(vlm, layers, target)
         elif tuning.method == "full":
-            model = inner = load_learning(vlm, tuning, spec.slots, layers, target)
+            model = inner = _load_learning(vlm, tuning, spec.slots, layers, target)
         else:
-            model, beyond = load_adapting(vlm, tuning, layers, target)
+            model, beyond = _load_adapting(vlm, tuning, layers, target)
             inner = model.base_model.model.model
         if tuning.method != "none" and tuning.gradient_checkpointing:
             inner.activation_checkpointing_enable({"use_reentrant": False})
@@ -127,13 +135,6 @@ class LiveVLM(nn.Module):
             features, valid = self._extractor.extract(rows)
         return features, valid.to(features.device)
 
-    def refuse_other_features(self, trained: Mapping[str, Any]) -> None:
-        """Raise `CheckpointMismatch` where this model does not compute the features of `trained`.
-
-        See the function `refuse_other_features`.
-        """
-        refuse_other_features(self.vlm, trained, self.spec)
-
     def check_shape(self, slots: int, feature_dim: int) -> None:
         """Raise `VLMError` where a policy was built for another number or width of features."""
         if (len(self.spec.slots), self.spec.dim) != (slots, feature_dim):
@@ -154,12 +155,161 @@ class LiveVLM(nn.Module):
             return
         folder.mkdir(parents=True, exist_ok=True)
         if self.tuning.method == "lora":
-            save_adapter(folder, self.model, self._beyond)
+            _save_adapter(folder, self.model, self._beyond)
         else:
-            save_checkpoint(folder, self.vlm, self.model.state_dict())
+            _save_checkpoint(folder, self.vlm, self.model.state_dict())
 
     def _precision(self) -> AbstractContextManager[Any]:
         """Autocast for a full tuning in half precision, whose learning weights are float32."""
         device = self._extractor.model.device.type
         half = self.tuning.method == "full" and self.vlm.dtype != "float32"
         return torch.autocast(device, getattr(torch, self.vlm.dtype) if half else None, half)
+
+
+def _load_adapting(
+    vlm: VLMParams, tuning: TuningParams, layers: int, device: torch.device
+) -> tuple[Any, dict[str, Tensor]]:
+    """A `PeftModel` of the first `layers` layers whose low-rank adapters learn, on the CPU.
+
+    There is one on every linear layer of the chosen towers; with `vlm.adapter`, training continues
+    from that adapter. Also returns that adapter's weights on later layers, which a saved adapter
+    keeps. Raises `VLMError` where the adapter has another rank, scale or towers than `tuning`.
+    """
+    whole = load_checkpoint(vlm, device)
+    # Features do not use the head.
+    whole.lm_head = nn.Identity()
+    if vlm.adapter is None:
+        model, beyond = _fresh_adapter(whole, vlm, tuning, layers), {}
+    else:
+        model = adapted(whole, vlm, tuning.lora_dropout)
+        _check_goes_on(model, vlm, tuning)
+        beyond = _beyond(model, layers)
+    cut(whole, layers)
+    model.requires_grad_(False)
+    learning = tuple(f"base_model.model.{_TOWERS[tower]}" for tower in tuning.towers)
+    for name, parameter in model.named_parameters():
+        parameter.requires_grad = "lora_" in name and name.startswith(learning)
+    model.peft_config["default"].base_model_name_or_path = vlm.checkpoint
+    model.peft_config["default"].revision = vlm.revision
+    return model, beyond
+
+
+def _load_learning(
+    vlm: VLMParams, tuning: TuningParams, slots: tuple[Slot, ...], layers: int, device: torch.device
+) -> Any:
+    """The inner model of the first `layers` layers, in which every weight of the towers learns.
+
+    Those weights are always float32, because `vlm.dtype` may be too coarse for small steps.
+    """
+    whole = cut(load_whole(vlm, device), layers)
+    whole.requires_grad_(False)
+    for tower in tuning.towers:
+        whole.get_submodule(_TOWERS[tower].rstrip(".")).float().requires_grad_(True)
+    if not any(slot.norm for slot in slots):
+        # Nothing reads the output of the final norm.
+        whole.model.language_model.norm.requires_grad_(False)
+    return whole.model
+
+
+def _save_adapter(folder: Path, model: Any, beyond: Mapping[str, Tensor]) -> None:
+    """Write the adapter of a `PeftModel` in peft's format, with its weights on later layers.
+
+    Raises `DiskFull`.
+    """
+    weights = folder / "adapter_model.safetensors"
+    with disk_full_named(folder):
+        # Otherwise peft asks the hub whether embeddings were resized, which never happens here.
+        model.save_pretrained(str(folder), save_embedding_layers=False)
+        # An empty template of a model card.
+        (folder / "README.md").unlink(missing_ok=True)
+        if beyond:
+            write_tensors(weights, load_file(weights) | dict(beyond))
+        _finish(folder)
+
+
+def _save_checkpoint(folder: Path, vlm: VLMParams, tuned: Mapping[str, Tensor]) -> None:
+    """Write the checkpoint of `vlm` with these weights in its inner model.
+
+    All other weights (with `vlm.adapter` merged) and files are those of the base; weights keep the
+    dtype of its files. Raises `DiskFull`.
+    """
+    plain = vlm.model_copy(update={"attention": "sdpa"})
+    whole = load_whole(plain, torch.device("cpu"), dtype="auto")
+    report = whole.model.load_state_dict(dict(tuned), strict=False)
+    assert not report.unexpected_keys, report.unexpected_keys
+    base = resolve_checkpoint(vlm.checkpoint, vlm.revision)
+    with disk_full_named(folder), quiet_transformers():
+        whole.save_pretrained(folder)
+        for path in (path for pattern in _COMPANIONS for path in base.glob(pattern)):
+            shutil.copyfile(path, folder / path.name)
+        _finish(folder)
+
+
+def _fresh_adapter(whole: Any, vlm: VLMParams, tuning: TuningParams, layers: int) -> Any:
+    from peft import LoraConfig, get_peft_model
+
+    config = LoraConfig(
+        r=tuning.lora_r,
+        lora_alpha=tuning.lora_alpha,
+        lora_dropout=tuning.lora_dropout,
+        target_modules=_targets(whole, tuning, layers),
+    )
+    with warnings.catch_warnings():
+        # peft 0.21 reads an attribute that is deprecated in transformers 5.23.
+        warnings.filterwarnings("ignore", "`is_gradient_checkpointing`", FutureWarning)
+        return get_peft_model(whole, config)
+
+
+def _targets(whole: Any, tuning: TuningParams, layers: int) -> str:
+    """A regular expression that matches the linear layers that run, and no other module.
+
+    It is written into the adapter's config, where a set of names would be in random order.
+    """
+    kept = "|".join(map(str, range(layers)))
+    towers = tuple(_TOWERS[tower] for tower in tuning.towers)
+    patterns: dict[str, None] = {}
+    for name, module in whole.named_modules():
+        if isinstance(module, nn.Linear) and name.startswith(towers):
+            pattern = re.sub(r"(blocks\\\.)\d+", r"\1\\d+", re.escape(name))
+            patterns[re.sub(r"(layers\\\.)\d+", rf"\1({kept})", pattern)] = None
+    return "|".join(patterns)
+
+
+def _check_goes_on(model: Any, vlm: VLMParams, tuning: TuningParams) -> None:
+    config = model.peft_config["default"]
+    # Other kinds of adapters lack them.
+    r, alpha = (getattr(config, name, None) for name in ("r", "lora_alpha"))
+    actual = f"lora_r {r}, lora_alpha {alpha}"
+    asked = f"lora_r {tuning.lora_r}, lora_alpha {tuning.lora_alpha}"
+    if actual != asked:
+        raise VLMError(
+            f"{vlm.adapter}: tuning goes on from this adapter of {actual}, but {asked} is asked "
+            "for. Set finetune.tuning to the adapter's values, or vlm.adapter to null."
+        )
+    names = [name for name, _ in model.named_parameters() if "lora_" in name]
+    for tower in tuning.towers:
+        if not any(name.startswith(f"base_model.model.{_TOWERS[tower]}") for name in names):
+            raise VLMError(
+                f"{vlm.adapter}: tuning goes on from this adapter, which has nothing in the "
+                f"{tower} tower. Leave it out of finetune.tuning.towers, or set vlm.adapter to "
+                "null."
+            )
+
+
+def _beyond(model: Any, layers: int) -> dict[str, Tensor]:
+    """The adapter's weights on decoder layers that do not run, by name in its file."""
+    place = re.compile(r"\.language_model\.layers\.(\d+)\..*\.lora_")
+    weights = ((name, place.search(name), tensor) for name, tensor in model.state_dict().items())
+    return {
+        name.replace(".default.", "."): tensor
+        for name, match, tensor in weights
+        if match and int(match[1]) >= layers
+    }
+
+
+def _finish(folder: Path) -> None:
+    """Give the files the folder's mode (safetensors writes only for the owner) and sync them."""
+    for file in folder.iterdir():
+        file.chmod(folder.stat().st_mode & 0o666)
+        sync(file)
+    sync(folder)

@@ -1,6 +1,6 @@
 """A checkpoint's processor: it turns an instruction and frames into text, tokens and pixels.
 
-The CPU only stretches frames (Pillow), without torch; `extractor` cuts them into patches on the
+The CPU only stretches frames (Pillow), without torch; `qwen` cuts them into patches on the
 model's device.
 """
 
@@ -250,7 +250,7 @@ class _ProcessorConfig(Document):
 def _read_image_processor(folder: Path) -> _ImageProcessor:
     """The settings of a checkpoint's image processor.
 
-    Raises `VLMError` where it does something else than `extractor.patchify`, or its patch sizes are
+    Raises `VLMError` where it does something else than `qwen.patchify`, or its patch sizes are
     not those of the model.
     """
     from transformers.models.qwen2_vl.image_processing_pil_qwen2_vl import Qwen2VLImageProcessorPil

@@ -388,16 +388,15 @@ class TestRefusals:
     def test_a_worker_elsewhere(self, params, changed, tmp_path, monkeypatch):
         spec = feature_spec(params.vlm, params.extract.dtype, ["View1", "View2"], file_digest)
         elsewhere = params.extract.model_copy(update={"workers": "tcp://elsewhere:8786"})
-        surveyed = Survey(
-            params.model_copy(update={"extract": elsewhere}), (), (), (), spec, "rotvec", "plan"
-        )
+        sections = params.data, params.vlm, elsewhere
+        surveyed = Survey(*sections, (), (), (), spec, "rotvec", "plan")
         plugin = ExtractionPlugin(surveyed, ())
         with pytest.raises(ConfigError, match=r"with the build .*made\.zarr\.part"):
             plugin.check_place()
         monkeypatch.setattr("pipeline.extract.cluster.read_plan", lambda part: "plan")
         plugin.check_place()
-        other_params = changed(vlm={"layers": [0]}, extract=elsewhere.model_dump())
-        other = ExtractionPlugin(replace(surveyed, params=other_params), ())
+        other_vlm = params.vlm.model_copy(update={"layers": (0,)})
+        other = ExtractionPlugin(replace(surveyed, vlm=other_vlm), ())
         with pytest.raises(ConfigError, match="would compute other features"):
             other.check_place()
         monkeypatch.chdir(tmp_path)
@@ -419,7 +418,8 @@ class TestRefusals:
     ):
         monkeypatch.setattr("torch.cuda.device_count", lambda: 2)
         params = changed(extract={"device": wanted, "workers": 4 if local else "tcp://a:1"})
-        surveyed = Survey(params, (), (), (), None, "rotvec", "")  # type: ignore[arg-type]
+        sections = params.data, params.vlm, params.extract
+        surveyed = Survey(*sections, (), (), (), None, "rotvec", "")  # type: ignore[arg-type]
         assert ExtractionPlugin(surveyed, ()).device_of(name) == device
 
     def test_errors_survive_the_way_from_a_worker(self):

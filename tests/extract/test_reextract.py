@@ -13,7 +13,7 @@ from pipeline.base.errors import StoreMismatch
 from pipeline.extract import extract
 from pipeline.extract.reextract import Deviation, Reextraction, reextract
 from pipeline.store.schema import chunk_paths, read_spec
-from pipeline.vlm.deviation import TOLERANCES
+from pipeline.vlm.slots import TOLERANCES
 
 
 def quiet(line: str) -> None:

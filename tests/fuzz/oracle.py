@@ -21,7 +21,7 @@ from pipeline.base.config import load_params
 from pipeline.base.digests import ContentDigests, ledger_path
 from pipeline.base.errors import StoreIncomplete
 from pipeline.data import RecordedAction
-from pipeline.extract.survey import check_episodes, sound_episodes, survey
+from pipeline.extract.survey import sound_episodes, survey
 from pipeline.policy import checkpoint as checkpoints
 from pipeline.store import FeatureStore
 from pipeline.store.verification import verify
@@ -43,10 +43,7 @@ def read_all(params: Any, frames: bool = True) -> None:
     """Survey and check recordings as extraction does, and then read all streams and all frames."""
     global read
     with closing(ContentDigests(ledger_path(params.extract.store))) as digests:
-        surveyed = survey(params, digests)
-        if surveyed.bad:
-            check_episodes(surveyed)
-        surveyed, _ = sound_episodes(surveyed, digests)
+        surveyed, _ = sound_episodes(survey(params, digests), digests)
     recordings = surveyed.recordings
     read = {
         recording.id.rpartition("/")[2]: _episode(recording, frames) for recording in recordings

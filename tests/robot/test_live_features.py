@@ -18,10 +18,10 @@ from pipeline.policy.checkpoint import PolicyCheckpoint
 from pipeline.robot.live_features import LiveFeatures, prove
 from pipeline.store import FeatureStore
 from pipeline.vlm.demo_checkpoint import write_demo_checkpoint
-from pipeline.vlm.deviation import TOLERANCES
 from pipeline.vlm.live import LiveVLM
 from pipeline.vlm.preparation import Preparer
 from pipeline.vlm.processor import PromptRenderer
+from pipeline.vlm.slots import TOLERANCES
 
 Frames = Mapping[str, np.ndarray]
 

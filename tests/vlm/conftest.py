@@ -1,13 +1,10 @@
 """What the tests of the frozen model share."""
 
 import hashlib
-from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from pipeline.base.config import VLMParams
 from pipeline.vlm.feature_spec import FeatureSpec, feature_spec
@@ -28,18 +25,18 @@ class Extractor:
 
 
 @pytest.fixture(scope="session")
-def digest_file() -> Callable[[Path], str]:
-    def digest(path: Path) -> str:
+def digest_file():
+    def digest(path):
         return hashlib.sha256(path.read_bytes()).hexdigest()
 
     return digest
 
 
 @pytest.fixture(scope="session")
-def vlm_params(demo_checkpoint: Path) -> Callable[..., VLMParams]:
+def vlm_params(demo_checkpoint):
     """Params of a small float32 extraction; keywords replace what they name."""
 
-    def params(**changes: object) -> VLMParams:
+    def params(**changes):
         small = {
             "checkpoint": str(demo_checkpoint),
             "dtype": "float32",
@@ -53,26 +50,32 @@ def vlm_params(demo_checkpoint: Path) -> Callable[..., VLMParams]:
 
 
 @pytest.fixture(scope="session")
-def extractor(
-    vlm_params: Callable[..., VLMParams], digest_file: Callable[[Path], str]
-) -> Callable[..., Extractor]:
-    """An extractor on the CPU; `storage_dtype` and `views` beside the params."""
+def extractor(vlm_params, digest_file):
+    """An extractor on the CPU; `storage_dtype` and `views` beside the params.
 
-    def build(
-        storage_dtype: str = "float32", views: tuple[str, ...] = VIEWS, **changes: object
-    ) -> Extractor:
-        vlm = vlm_params(**changes)
-        spec = feature_spec(vlm, storage_dtype, views, digest_file)
-        return Extractor(vlm, spec, Preparer(vlm, spec), FrozenVLM.load(vlm, spec, "cpu"))
+    Made once each, except `anew` and for a folder that a test may change.
+    """
+    made: dict[str, Extractor] = {}
+
+    def build(storage_dtype="float32", views=VIEWS, anew=False, **changes):
+        key = repr((storage_dtype, views, changes))
+        if anew or key not in made or {"checkpoint", "adapter"} & changes.keys():
+            vlm = vlm_params(**changes)
+            spec = feature_spec(vlm, storage_dtype, views, digest_file)
+            model = FrozenVLM.load(vlm, spec, "cpu")
+            made[key] = Extractor(vlm, spec, Preparer(vlm, spec), model)
+            if anew:
+                return made.pop(key)
+        return made[key]
 
     return build
 
 
 @pytest.fixture(scope="session")
-def make_frame() -> Callable[..., NDArray[np.uint8]]:
+def make_frame():
     """A smooth random frame: noise alone would vanish in the resize."""
 
-    def frame(seed: int, height: int = 180, width: int = 240) -> NDArray[np.uint8]:
+    def frame(seed, height=180, width=240):
         generator = np.random.default_rng(seed)
         y, x = np.mgrid[0:height, 0:width]
         waves = generator.uniform(0.01, 0.08, (3, 2))

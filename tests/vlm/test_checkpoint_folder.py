@@ -4,12 +4,10 @@ import json
 import os
 import shutil
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import pytest
 
-from pipeline.base.config import VLMParams
 from pipeline.base.digests import file_digest
 from pipeline.base.errors import VLMError
 from pipeline.vlm.checkpoint_folder import read_config, resolve_checkpoint
@@ -23,22 +21,22 @@ Spec = Callable[..., object]
 
 
 @pytest.fixture
-def folder(demo_checkpoint: Path, tmp_path: Path) -> Path:
+def folder(demo_checkpoint, tmp_path):
     return shutil.copytree(demo_checkpoint, tmp_path / "vlm")
 
 
 @pytest.fixture
-def spec(vlm_params: Callable[..., VLMParams]) -> Spec:
+def spec(vlm_params):
     """What a plan reads of a checkpoint: all but its weights."""
 
-    def read(folder: Path) -> object:
+    def read(folder):
         vlm = vlm_params(checkpoint=str(folder))
         return feature_spec(vlm, "float32", ("View1",), file_digest, lambda what, make: make())
 
     return read
 
 
-def _edit(path: Path, place: str, value: object) -> None:
+def _edit(path, place, value):
     document = json.loads(path.read_text())
     *outer, last = place.split(".")
     inside = document
@@ -64,45 +62,42 @@ ROPE = "text_config.rope_parameters"
         (CONFIG, "vision_config.window_size", 0, "window_size 0 of 28 or more"),
         (CONFIG, "vision_config.window_size", None, "window_size.*got NoneType"),
         (CONFIG, "vision_config.fullatt_block_indexes", [4], r"\[4\] below depth 4"),
-        (CONFIG, "vision_config", [1], r"vision_config.*\[1\]"),
         (CONFIG, "text_config.head_dim", 16, "head_dim to be 32"),
-        (CONFIG, ROPE, None, "mrope_section"),
         (
             CONFIG,
             f"{ROPE}.mrope_section",
             [8, 8],
             r"three mrope_section .*found \[8, 8\]",
         ),
-        (CONFIG, "text_config.hidden_act", [], r"config\.json: cannot be read .*hidden_act"),
         (CONFIG, "image_token_id", -1, r"config\.json.* cannot be read: OverflowError"),
-        (PIXELS, "image_mean", [0.5], r"image_mean\.1: missing"),
         (PIXELS, "image_std", [0, 1, 1], r"image_std\.0: expected greater than 0, found 0"),
-        (PIXELS, "rescale_factor", None, "rescale_factor: expected a valid number, found None"),
         (PIXELS, "resample", 2, "expected resample 3, found 2"),
-        (PIXELS, "do_resize", False, "expected do_resize True, found False"),
         (PIXELS, "image_processor_type", "CLIP", "image_processor_type .*found 'CLIP'"),
         (PIXELS, "patch_size", 7, "expected patch_size 14, found 7"),
         (TOKENS, "tokenizer_class", "Own", "tokenizer_class: .*Qwen2Tokenizer.*'Own'"),
         (TOKENS, "eos_token", 5, r"tokenizer_config\.json cannot be read: .*eos_token"),
-        ("tokenizer.json", "model.merges", [], r"merges are cut off: expected \d+ .*found 0"),
-        ("tokenizer.json", "model.vocab.!", "a", r"tokenizer\.json .* cannot be read: .*[Vv]ocab"),
-        ("tokenizer.json", "normalizer", {"type": "Own"}, r"tokenizer\.json .* cannot be read"),
     ],
 )
-def test_what_a_file_may_not_say(
-    folder: Path, spec: Spec, name: str, place: str, value: object, told: str
-) -> None:
+def test_what_a_file_may_not_say(folder, spec, name, place, value, told):
     _edit(folder / name, place, value)
     with pytest.raises(VLMError, match=rf"(?s){folder}.*{told}.*{MEND}") as refused:
         spec(folder)
     assert len(str(refused.value)) < 1500
 
 
-@pytest.mark.parametrize("name", [CONFIG, PIXELS, TOKENS, "tokenizer.json", "extra.json"])
-@pytest.mark.parametrize("kind", ["pipe", "folder", "device", "deep"])
-def test_a_file_that_is_none_is_never_opened(
-    folder: Path, spec: Spec, name: str, kind: str
-) -> None:
+@pytest.mark.parametrize(
+    ("name", "kind"),
+    [
+        (CONFIG, "pipe"),
+        (CONFIG, "folder"),
+        (CONFIG, "deep"),
+        (PIXELS, "device"),
+        (TOKENS, "pipe"),
+        ("tokenizer.json", "device"),
+        ("extra.json", "pipe"),
+    ],
+)
+def test_a_file_that_is_none_is_never_opened(folder, spec, name, kind):
     path = folder / name
     path.unlink(missing_ok=True)
     if kind == "pipe":
@@ -113,9 +108,6 @@ def test_a_file_that_is_none_is_never_opened(
         path.symlink_to("/dev/zero")
     else:
         path.write_text('{"a":' * 100_000 + "1" + "}" * 100_000)
-    if (name, kind) == ("extra.json", "deep"):
-        spec(folder)
-        return
     with pytest.raises(VLMError, match=rf"(?s){folder}.*{name}.*(found a|[Rr]ecursion).*{MEND}"):
         spec(folder)
 
@@ -123,21 +115,17 @@ def test_a_file_that_is_none_is_never_opened(
 @pytest.mark.parametrize(
     ("template", "told"),
     [
-        ("{% for i in range(10**9) %}{% endfor %}", "OverflowError"),
         ("{{ ''.__class__.__mro__ }}", "SecurityError"),
-        ("{{ raise_exception('no') }}", "TemplateError: no"),
-        ("{% for %}", "TemplateSyntaxError"),
-        ("{{ 1 / 0 }}", "ZeroDivisionError"),
         ("{{ " + "(" * 5000 + "1" + ")" * 5000 + " }}", "RecursionError"),
     ],
 )  # fmt: skip
-def test_a_chat_template_that_cannot_be_rendered(folder: Path, template: str, told: str) -> None:
+def test_a_chat_template_that_cannot_be_rendered(folder, template, told):
     _edit(folder / TOKENS, "chat_template", template)
     with pytest.raises(VLMError, match=rf"{folder}: .*chat template.*{told}.*{MEND}"):
         PromptRenderer(folder, "{instruction}").render("go", 1)
 
 
-def test_an_index_names_files_of_its_own_folder(folder: Path, spec: Spec) -> None:
+def test_an_index_names_files_of_its_own_folder(folder, spec):
     index = folder / "model.safetensors.index.json"
     for weight_map, told in (
         (
@@ -153,7 +141,7 @@ def test_an_index_names_files_of_its_own_folder(folder: Path, spec: Spec) -> Non
             spec(folder)
 
 
-def test_merges_that_are_cut_off_are_not_taken_for_whole(folder: Path, spec: Spec) -> None:
+def test_merges_that_are_cut_off_are_not_taken_for_whole(folder, spec):
     whole = json.loads((folder / "tokenizer.json").read_text())
     (folder / "tokenizer.json").unlink()
     (folder / "vocab.json").write_text(json.dumps(whole["model"]["vocab"]))
@@ -165,13 +153,12 @@ def test_merges_that_are_cut_off_are_not_taken_for_whole(folder: Path, spec: Spe
         spec(folder)
 
 
-@pytest.mark.parametrize("kernel", ["attn_implementation", "_attn_implementation"])
-def test_no_kernel_is_fetched(folder: Path, spec: Spec, kernel: str) -> None:
-    _edit(folder / CONFIG, kernel, {"": "sdpa", "text_config": "someone/kernel"})
-    with pytest.raises(
-        VLMError, match=rf"config\.json: .*no code .*found {kernel} .*someone/kernel"
-    ):
-        spec(folder)
+def test_no_kernel_is_fetched(folder, spec):
+    for key in ("attn_implementation", "_attn_implementation", "_experts_implementation"):
+        _edit(folder / CONFIG, key, {"": "sdpa", "text_config": "someone/kernel"})
+        with pytest.raises(VLMError, match=rf"config\.json: .*no code .*found {key} .*e/kernel"):
+            spec(folder)
+        _edit(folder / CONFIG, key, ...)
 
 
 PROMPT_MEND = r"Change the instruction in the recording, data\.sources or vlm\.prompt"
@@ -187,9 +174,7 @@ PROMPT_MEND = r"Change the instruction in the recording, data\.sources or vlm\.p
         ("a\ud800b", "cannot be cut into tokens"),
     ],
 )
-def test_a_prompt_is_no_longer_than_the_models_window(
-    folder: Path, vlm_params: Callable[..., VLMParams], instruction: str, told: str
-) -> None:
+def test_a_prompt_is_no_longer_than_the_models_window(folder, vlm_params, instruction, told):
     _edit(folder / CONFIG, "text_config.max_position_embeddings", 1000)
     vlm = vlm_params(checkpoint=str(folder))
     preparer = Preparer(vlm, feature_spec(vlm, "float32", ("View1",), file_digest))
@@ -199,9 +184,9 @@ def test_a_prompt_is_no_longer_than_the_models_window(
 
 @pytest.mark.parametrize(
     "name",
-    ["a\0b", "\ud800", "../x", "../../etc/passwd", "x" * 5000, "~nobody-here/x", "/dev/null"],
+    ["a\0b", "../x", "x" * 5000, "~nobody-here/x"],
 )
-def test_a_name_that_is_no_folder_and_no_hub_id(name: str) -> None:
+def test_a_name_that_is_no_folder_and_no_hub_id(name):
     for setting in ("vlm.checkpoint", "vlm.adapter"):
         with pytest.raises(VLMError, match=rf"{setting} .{{1,200}}: no such folder.*stages\.demo"):
             resolve_checkpoint(name, setting=setting)
@@ -238,7 +223,7 @@ FLAT: dict[str, Any] = {
 """As the hub has it."""
 
 
-def test_what_the_hub_and_older_versions_write_is_read(folder: Path) -> None:
+def test_what_the_hub_and_older_versions_write_is_read(folder):
     config_of_the_folder = (folder / CONFIG).read_text()
     short = {"hidden_size": 1280, "in_chans": 3, "model_type": "qwen2_5_vl"}
     text = {**FLAT, "model_type": "qwen2_5_vl_text", "image_token_id": None}
@@ -261,18 +246,13 @@ def test_what_the_hub_and_older_versions_write_is_read(folder: Path) -> None:
     ("name", "place", "value", "told"),
     [
         ("preprocessor_config.json", "max_pixels", "x", r"longest_edge: .* found 'x'"),
-        ("preprocessor_config.json", "max_pixels", [1], r"longest_edge: .* found \[1\]"),
-        ("preprocessor_config.json", "max_pixels", 0, "longest_edge: .* found 0"),
-        ("preprocessor_config.json", "min_pixels", 10**400, "shortest_edge: expected"),
-        ("preprocessor_config.json", "patch_size", 14.0, "patch_size: .* found 14.0"),
         ("preprocessor_config.json", "image_std", ["1", "1", "1"], "image_std.0: .* found '1'"),
-        ("processor_config.json", "image_processor", [1], "image_processor: expected an object"),
         ("processor_config.json", "image_processor", {"patch_size": 14.0}, "patch_size: .* 14.0"),
     ],
 )
 def test_pixel_settings_of_a_wrong_type_are_refused_in_their_file(
-    demo_checkpoint: Path, tmp_path: Path, name: str, place: str, value: object, told: str
-) -> None:
+    demo_checkpoint, tmp_path, name, place, value, told
+):
     path = shutil.copytree(demo_checkpoint, tmp_path / "vlm") / name
     document = json.loads(path.read_text()) if path.exists() else {}
     path.write_text(json.dumps(document | {place: value}))
@@ -280,26 +260,19 @@ def test_pixel_settings_of_a_wrong_type_are_refused_in_their_file(
         PixelSettings.read(path.parent, (112, 140))
 
 
-@pytest.mark.parametrize(
-    ("part", "key"),
-    [
-        *(("text_config", key) for key in ("hidden_size", "num_hidden_layers", "rms_norm_eps")),
-        ("text_config", "max_position_embeddings"),
-        *(("vision_config", key) for key in ("num_heads", "fullatt_block_indexes")),
-    ],
-)
-def test_a_config_without_a_value_that_decides_features_is_refused(
-    demo_checkpoint: Path, tmp_path: Path, part: str, key: str
-) -> None:
-    path = shutil.copytree(demo_checkpoint, tmp_path / "vlm") / "config.json"
-    document = json.loads(path.read_text())
-    del document[part][key]
-    path.write_text(json.dumps(document))
-    with pytest.raises(VLMError, match=rf"config\.json: {part}.*(: missing|{key})"):
-        read_config(path.parent)
+def test_a_config_without_a_value_that_decides_features_is_refused(folder):
+    whole = (folder / CONFIG).read_text()
+    text = ("hidden_size", "num_hidden_layers", "rms_norm_eps", "max_position_embeddings")
+    vision = ("num_heads", "fullatt_block_indexes")
+    for part, keys in (("text_config", text), ("vision_config", vision)):
+        for key in keys:
+            (folder / CONFIG).write_text(whole)
+            _edit(folder / CONFIG, f"{part}.{key}", ...)
+            with pytest.raises(VLMError, match=rf"config\.json: {part}.*(: missing|{key})"):
+                read_config(folder)
 
 
-def test_no_tokenizer_file_of_another_folder_is_read(demo_checkpoint: Path, tmp_path: Path) -> None:
+def test_no_tokenizer_file_of_another_folder_is_read(demo_checkpoint, tmp_path):
     path = shutil.copytree(demo_checkpoint, tmp_path / "vlm") / "tokenizer_config.json"
     elsewhere = {"fast_tokenizer_files": ["../other/tokenizer.4.0.0.json"]}
     path.write_text(json.dumps(json.loads(path.read_text()) | elsewhere))

@@ -1,9 +1,6 @@
 """Equal images reach the tower once; a batch of equal layout keeps its shape."""
 
-from collections.abc import Callable
 from contextlib import suppress
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -11,7 +8,6 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
-from numpy.typing import NDArray
 
 from pipeline.base.errors import VLMError
 from pipeline.vlm.collation import Collator, unique
@@ -19,7 +15,7 @@ from pipeline.vlm.qwen import FrozenVLM
 
 
 @given(st.lists(arrays(np.uint8, (2, 3, 3), elements=st.integers(0, 1)), max_size=12))
-def test_unique_says_which_image_is_which(images: list[NDArray[np.uint8]]) -> None:
+def test_unique_says_which_image_is_which(images):
     distinct, which = unique(images)
     assert len(distinct) == len({image.tobytes() for image in images})
     assert all(
@@ -27,7 +23,7 @@ def test_unique_says_which_image_is_which(images: list[NDArray[np.uint8]]) -> No
     )
 
 
-def test_images_that_differ_where_nobody_looks_are_told_apart() -> None:
+def test_images_that_differ_where_nobody_looks_are_told_apart():
     image = np.zeros((80, 80, 3), np.uint8)
     other = image.copy()
     other[0, 0, 1] = 1
@@ -37,14 +33,14 @@ def test_images_that_differ_where_nobody_looks_are_told_apart() -> None:
 
 
 @pytest.fixture
-def seen(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+def seen(monkeypatch):
     """How many images each pass of the tower sees."""
     from pipeline.vlm.vision import VisionTower
 
     counts: list[int] = []
     real = VisionTower.plan
 
-    def plan(self: VisionTower, images: int, device: torch.device) -> Any:
+    def plan(self, images, device):
         counts.append(images)
         return real(self, images, device)
 
@@ -52,9 +48,7 @@ def seen(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     return counts
 
 
-def test_equal_images_of_a_batch_are_seen_once(
-    extractor: Callable[..., Any], make_frame: Callable[..., NDArray[np.uint8]], seen: list[int]
-) -> None:
+def test_equal_images_of_a_batch_are_seen_once(extractor, make_frame, seen):
     ours = extractor(pooling=["mean", "view_mean"])
     a, b, c = (make_frame(seed) for seed in range(3))
     rows = [
@@ -73,8 +67,8 @@ def test_equal_images_of_a_batch_are_seen_once(
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:`torch.jit.script_method`:DeprecationWarning")
 def test_a_compiled_model_gives_the_same_features_and_is_compiled_once_a_shape(
-    extractor: Callable[..., Any], make_frame: Callable[..., NDArray[np.uint8]]
-) -> None:
+    extractor, make_frame
+):
     plain = extractor(pooling=["mean", "grid"], layers=[-1, 1], norms=[True, False])
     compiled = FrozenVLM.load(plain.vlm, plain.spec, "cpu", compile=True)
     frames = [{view: make_frame(7 * i + j) for j, view in enumerate(VIEWS)} for i in range(4)]
@@ -91,16 +85,14 @@ def test_a_compiled_model_gives_the_same_features_and_is_compiled_once_a_shape(
 
 @pytest.mark.filterwarnings("ignore:`torch.jit.script_method`:DeprecationWarning")
 def test_a_compiled_model_is_given_sizes_that_it_has_seen_and_that_fit(
-    extractor: Callable[..., Any],
-    make_frame: Callable[..., NDArray[np.uint8]],
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+    extractor, make_frame, monkeypatch
+):
     monkeypatch.setattr(torch, "compile", lambda part, **options: part)
     plain = extractor(pooling=["mean"])
     compiled = FrozenVLM.load(plain.vlm, plain.spec, "cpu", compile=True)
     given, real, room = [], Collator.collate, [99]
 
-    def collate(self: Collator, rows: Any) -> Any:
+    def collate(self, rows):
         given.append(len(rows))
         if len(rows) > room[0]:
             raise torch.OutOfMemoryError("too many")
@@ -120,12 +112,7 @@ def test_a_compiled_model_is_given_sizes_that_it_has_seen_and_that_fit(
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:`torch.jit.script_method`:DeprecationWarning")
-def test_no_compiler_is_said(
-    extractor: Callable[..., Any],
-    make_frame: Callable[..., NDArray[np.uint8]],
-    monkeypatch: pytest.MonkeyPatch,
-    tmp_path: Path,
-) -> None:
+def test_no_compiler_is_said(extractor, make_frame, monkeypatch, tmp_path):
     from torch._inductor import config
 
     monkeypatch.setattr(config.cpp, "cxx", (str(tmp_path / "no_compiler"),))

@@ -1,23 +1,20 @@
 """The demo's checkpoint is small, reproducible, and sees where things are."""
 
-from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from safetensors import safe_open
 from transformers import AutoTokenizer
 
 from pipeline.vlm.demo_checkpoint import write_demo_checkpoint
 
 
-def _bytes(folder: Path) -> dict[str, bytes]:
+def _bytes(folder):
     return {path.name: path.read_bytes() for path in folder.iterdir()}
 
 
-def test_same_seed_same_bytes(demo_checkpoint: Path, tmp_path: Path) -> None:
+def test_same_seed_same_bytes(demo_checkpoint, tmp_path):
     before = torch.random.get_rng_state()
     write_demo_checkpoint(tmp_path / "again")
     assert _bytes(tmp_path / "again") == _bytes(demo_checkpoint)
@@ -29,7 +26,7 @@ def test_same_seed_same_bytes(demo_checkpoint: Path, tmp_path: Path) -> None:
     assert torch.equal(torch.random.get_rng_state(), before)
 
 
-def test_it_has_the_hubs_layout_and_a_few_million_parameters(demo_checkpoint: Path) -> None:
+def test_it_has_the_hubs_layout_and_a_few_million_parameters(demo_checkpoint):
     assert {path.name for path in demo_checkpoint.iterdir()} == {
         "config.json",
         "generation_config.json",
@@ -45,7 +42,7 @@ def test_it_has_the_hubs_layout_and_a_few_million_parameters(demo_checkpoint: Pa
     assert 1e6 < parameters < 1e7
 
 
-def test_the_tokenizer_has_merges_and_keeps_any_text(demo_checkpoint: Path) -> None:
+def test_the_tokenizer_has_merges_and_keeps_any_text(demo_checkpoint):
     tokenizer: Any = AutoTokenizer.from_pretrained(demo_checkpoint)
     text = "Insert the needle 12.5 mm into the phantom, Größe µ 针\n"
     ids = tokenizer(text)["input_ids"]
@@ -54,14 +51,14 @@ def test_the_tokenizer_has_merges_and_keeps_any_text(demo_checkpoint: Path) -> N
     assert len(tokenizer) > 600
 
 
-def _disc(x: float, y: float) -> NDArray[np.uint8]:
+def _disc(x, y):
     rows, columns = (np.mgrid[0:112, 0:140] + 0.5) / np.array([112, 140])[:, None, None]
     image = np.full((112, 140, 3), 90, np.uint8)
     image[(columns - x) ** 2 + (rows - y) ** 2 < 0.08**2] = (220, 60, 40)
     return image
 
 
-def _ridge_r2(features: NDArray[np.float64], places: NDArray[np.float64]) -> float:
+def _ridge_r2(features, places):
     """R² on the last quarter of a ridge regression fitted on the rest."""
     fitted = len(features) * 3 // 4
     train, test = features[:fitted], features[fitted:]
@@ -74,7 +71,7 @@ def _ridge_r2(features: NDArray[np.float64], places: NDArray[np.float64]) -> flo
     return float(1 - (error**2).sum() / ((places[fitted:] - places[fitted:].mean(0)) ** 2).sum())
 
 
-def test_grid_finds_a_disc_and_mean_does_so_less(extractor: Callable[..., Any]) -> None:
+def test_grid_finds_a_disc_and_mean_does_so_less(extractor):
     eye = extractor(views=("View1",), pooling=["mean", "grid"])
     places = np.random.default_rng(0).uniform(0.12, 0.88, (320, 2))
     rows = [eye.preparer.prepare("insert", {"View1": _disc(x, y)}) for x, y in places]

@@ -2,24 +2,16 @@
 
 import json
 import shutil
-import subprocess
-import sys
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 from huggingface_hub.errors import LocalEntryNotFoundError
-from numpy.typing import NDArray
 from safetensors.torch import load_file, save_file
 
-from pipeline.base.config import VLMParams
-from pipeline.base.differences import describe, differences
+from pipeline.base.differences import differences
 from pipeline.base.errors import VLMError
 from pipeline.vlm.checkpoint_folder import resolve_checkpoint, weight_files
 from pipeline.vlm.feature_spec import (
-    FeatureSpec,
     feature_spec,
 )
 from pipeline.vlm.slots import Slot
@@ -28,20 +20,14 @@ VIEWS = ("View1", "View2", "View3")
 
 
 @pytest.fixture
-def spec_of(
-    vlm_params: Callable[..., VLMParams], digest_file: Callable[[Path], str]
-) -> Callable[..., FeatureSpec]:
-    def build(
-        views: tuple[str, ...] = VIEWS, storage_dtype: str = "float32", **changes: object
-    ) -> FeatureSpec:
+def spec_of(vlm_params, digest_file):
+    def build(views=VIEWS, storage_dtype="float32", **changes):
         return feature_spec(vlm_params(**changes), storage_dtype, views, digest_file)
 
     return build
 
 
-def test_document_is_json_with_what_a_person_wants_to_see(
-    spec_of: Callable[..., FeatureSpec],
-) -> None:
+def test_document_is_json_with_what_a_person_wants_to_see(spec_of):
     spec = spec_of(views=("View2", "View1"), image_resize_height=360, image_resize_width=640)
     assert json.loads(json.dumps(spec.attrs())) == spec.attrs()
     assert spec.attrs()["digest"] == spec.digest
@@ -57,7 +43,7 @@ def test_document_is_json_with_what_a_person_wants_to_see(
     )
 
 
-def test_slots_go_by_layer_norm_pooling(spec_of: Callable[..., FeatureSpec]) -> None:
+def test_slots_go_by_layer_norm_pooling(spec_of):
     spec = spec_of(
         views=("View1", "View2"),
         layers=[-1, 1],
@@ -82,9 +68,7 @@ def test_slots_go_by_layer_norm_pooling(spec_of: Callable[..., FeatureSpec]) -> 
     }
 
 
-def test_variants_are_named_only_where_there_are_several(
-    spec_of: Callable[..., FeatureSpec],
-) -> None:
+def test_variants_are_named_only_where_there_are_several(spec_of):
     """So that stores of one variant keep their digest, and what was extracted stays known."""
     one = spec_of()
     assert spec_of(variants=1, augmentation={"rotation_deg": 30, "seed": 7}) == one
@@ -122,9 +106,7 @@ def test_variants_are_named_only_where_there_are_several(
     assert json.loads(json.dumps(three.attrs())) == three.attrs()
 
 
-def test_digest_and_keys_move_with_variants_and_augmentation(
-    spec_of: Callable[..., FeatureSpec],
-) -> None:
+def test_digest_and_keys_move_with_variants_and_augmentation(spec_of):
     specs = [
         spec_of(),
         spec_of(variants=2),
@@ -138,32 +120,29 @@ def test_digest_and_keys_move_with_variants_and_augmentation(
     assert differences(specs[2].attrs(), specs[3].attrs()) == {"augmentation.seed": (0, 1)}
 
 
-CHANGES: dict[str, dict[str, Any]] = {
-    "dtype": {"dtype": "bfloat16"},
-    "storage": {"storage_dtype": "float16"},
-    "views": {"views": ("View1", "View2")},
-    "height": {"image_resize_height": 140},
-    "width": {"image_resize_width": 168},
-    "same pixels, another request": {"image_resize_width": 141},
-    "prompt": {"prompt": "{images}{instruction}"},
-    "layers": {"layers": [1]},
-    "norms": {"norms": [False]},
-    "pooling": {"pooling": ["last"]},
-}
+CHANGES = [
+    {"dtype": "bfloat16"},
+    {"storage_dtype": "float16"},
+    {"views": ("View1", "View2")},
+    {"image_resize_height": 140},
+    {"image_resize_width": 168},
+    {"image_resize_width": 141},  # the same pixels, another request
+    {"prompt": "{images}{instruction}"},
+    {"layers": [1]},
+    {"norms": [False]},
+    {"pooling": ["last"]},
+]
 
 
-@pytest.mark.parametrize("change", CHANGES.values(), ids=CHANGES.keys())
-def test_digest_moves_with_each_param(
-    spec_of: Callable[..., FeatureSpec], change: dict[str, Any]
-) -> None:
-    base, changed = spec_of(), spec_of(**change)
-    assert changed.digest != base.digest
-    assert differences(base.attrs(), changed.attrs())
+def test_digest_moves_with_each_param_and_with_the_code(spec_of, monkeypatch):
+    specs = [spec_of(**change) for change in ({}, *CHANGES)]
+    monkeypatch.setattr("pipeline.vlm.feature_spec.EXTRACTOR_VERSION", 999)
+    specs.append(spec_of())
+    assert len({spec.digest for spec in specs}) == len(specs)
+    assert all(differences(specs[0].attrs(), spec.attrs()) for spec in specs[1:])
 
 
-def test_digest_stays_where_features_do(
-    spec_of: Callable[..., FeatureSpec], demo_checkpoint: Path, tmp_path: Path
-) -> None:
+def test_digest_stays_where_features_do(spec_of, demo_checkpoint, tmp_path):
     moved = shutil.copytree(demo_checkpoint, tmp_path / "moved")
     (moved / "README.md").write_text("not read by the model")
     base = spec_of()
@@ -173,73 +152,50 @@ def test_digest_stays_where_features_do(
     assert differences(base.attrs(), spec_of(attention="eager").attrs()) == {}
 
 
-def _touch_weight(folder: Path) -> None:
+def _touch_weight(folder):
     path = folder / "model.safetensors"
     weights = load_file(path)
     weights["model.norm.weight"][0] += 1e-3
     save_file(weights, path, metadata={"format": "pt"})
 
 
-def _edit(name: str, **changes: object) -> Callable[[Path], None]:
-    def edit(folder: Path) -> None:
+def _edit(name, **changes):
+    def edit(folder):
         path = folder / name
         path.write_text(json.dumps(json.loads(path.read_text()) | changes))
 
     return edit
 
 
-def _rename_token(folder: Path) -> None:
+def _rename_token(folder):
     path = folder / "tokenizer.json"
     path.write_text(path.read_text().replace("<|box_end|>", "<|box_fin|>"))
 
 
-FILES: dict[str, tuple[Callable[[Path], None], str]] = {
-    "weights": (_touch_weight, "weights"),
-    "config": (_edit("config.json", tie_word_embeddings=False), "weights"),
-    "mean": (_edit("preprocessor_config.json", image_mean=[0.5, 0.5, 0.5]), "processor.image_mean"),
-    "limits": (_edit("preprocessor_config.json", max_pixels=12000), "processor.image_size"),
-    "tokenizer": (_rename_token, "tokenizer"),
-    "chat template": (
+FILES = [
+    (_touch_weight, "weights"),
+    (_edit("config.json", tie_word_embeddings=False), "weights"),
+    (_edit("preprocessor_config.json", image_mean=[0.5, 0.5, 0.5]), "processor.image_mean"),
+    (_edit("preprocessor_config.json", max_pixels=12000), "processor.image_size"),
+    (_rename_token, "tokenizer"),
+    (
         _edit("tokenizer_config.json", chat_template="{{ '<|image_pad|>' * 3 }}"),
         "chat_template",
     ),
-}
+]
 
 
-@pytest.mark.parametrize(("change", "place"), FILES.values(), ids=FILES.keys())
-def test_digest_moves_with_each_file(
-    spec_of: Callable[..., FeatureSpec],
-    demo_checkpoint: Path,
-    tmp_path: Path,
-    change: Callable[[Path], None],
-    place: str,
-) -> None:
-    folder = shutil.copytree(demo_checkpoint, tmp_path / "changed")
-    change(folder)
-    base, changed = spec_of(), spec_of(checkpoint=str(folder))
-    assert changed.digest != base.digest
-    assert place in differences(base.document, changed.document)
-
-
-def test_extractor_version_is_part_of_it(
-    spec_of: Callable[..., FeatureSpec], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_digest_moves_with_each_file(spec_of, demo_checkpoint, tmp_path):
     base = spec_of()
-    monkeypatch.setattr("pipeline.vlm.feature_spec.EXTRACTOR_VERSION", 999)
-    assert spec_of().digest != base.digest
+    for number, (change, place) in enumerate(FILES):
+        folder = shutil.copytree(demo_checkpoint, tmp_path / str(number))
+        change(folder)
+        changed = spec_of(checkpoint=str(folder))
+        assert changed.digest != base.digest
+        assert place in differences(base.document, changed.document)
 
 
-def test_differences_are_readable(spec_of: Callable[..., FeatureSpec]) -> None:
-    base, changed = spec_of(), spec_of(prompt="{images}", pooling=["mean", "last"])
-    lines = describe(differences(base.attrs(), changed.attrs()))
-    assert r'prompt: "{instruction}\n{images}\n{instruction}" -> "{images}"' in lines
-    assert "slots: 1 entries -> 2 entries" in lines
-    assert all(len(line) < 250 for line in lines)
-
-
-def test_row_key_moves_with_spec_prompt_pixels_shape_and_view(
-    spec_of: Callable[..., FeatureSpec], make_frame: Callable[..., NDArray[np.uint8]]
-) -> None:
+def test_row_key_moves_with_spec_prompt_pixels_shape_and_view(spec_of, make_frame):
     spec = spec_of()
     frames = {view: make_frame(seed, 24, 32) for seed, view in enumerate(VIEWS)}
     one_value = {view: frame.copy() for view, frame in frames.items()}
@@ -269,24 +225,17 @@ def test_row_key_moves_with_spec_prompt_pixels_shape_and_view(
     ("changes", "message"),
     [
         ({"layers": [4]}, r"expected -4 to 3 for a model of 4 decoder layers, .*found \[4\]"),
-        ({"layers": [-5]}, r"found \[-5\]"),
         ({"layers": [-1, 3]}, r"each layer once, found \[-1, 3\]"),
         ({"pooling": ["mean", "mean"]}, r"vlm\.pooling: each may stand once"),
-        ({"norms": [True, True]}, r"vlm\.norms: each may stand once"),
-        ({"checkpoint": "./nowhere"}, r"vlm\.checkpoint ./nowhere: no such folder"),
         ({"adapter": "/nowhere"}, r"vlm\.adapter /nowhere: no such folder"),
     ],
 )
-def test_bad_params_are_named(
-    spec_of: Callable[..., FeatureSpec], changes: dict[str, Any], message: str
-) -> None:
+def test_bad_params_are_named(spec_of, changes, message):
     with pytest.raises(VLMError, match=message):
         spec_of(**changes)
 
 
-def test_a_hub_id_that_is_not_there_says_what_to_run(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_a_hub_id_that_is_not_there_says_what_to_run(monkeypatch, tmp_path):
     monkeypatch.setattr("huggingface_hub.constants.HF_HUB_OFFLINE", True)
     monkeypatch.setattr("huggingface_hub.constants.HF_HUB_CACHE", str(tmp_path))
     monkeypatch.chdir(tmp_path)
@@ -297,23 +246,18 @@ def test_a_hub_id_that_is_not_there_says_what_to_run(
     assert "Error" not in said and "stages.doctor" in said
 
 
-@pytest.mark.parametrize("error", [OSError("the hub says no\nand more"), PermissionError("denied")])
-def test_a_download_that_is_refused_says_why(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, error: OSError
-) -> None:
-    def refuse(*args: object, local_files_only: bool = False, **settings: object) -> str:
-        raise LocalEntryNotFoundError("not cached") if local_files_only else error
+def test_a_download_that_is_refused_says_why(monkeypatch, tmp_path):
+    def refuse(*args, local_files_only=False, **settings):
+        missing = LocalEntryNotFoundError("not cached")
+        raise missing if local_files_only else OSError("the hub says no\nand more")
 
     monkeypatch.setattr("huggingface_hub.snapshot_download", refuse)
     monkeypatch.chdir(tmp_path)
-    why = str(error).partition("\n")[0]
-    with pytest.raises(VLMError, match=rf"as a hub id, it cannot be downloaded: {why}\. If it is"):
+    with pytest.raises(VLMError, match=r"cannot be downloaded: the hub says no\. If it is"):
         resolve_checkpoint("someone/small-vl")
 
 
-def test_a_cached_hub_copy_is_used_without_network(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, demo_checkpoint: Path
-) -> None:
+def test_a_cached_hub_copy_is_used_without_network(monkeypatch, tmp_path, demo_checkpoint):
     monkeypatch.setattr("huggingface_hub.constants.HF_HUB_OFFLINE", True)
     monkeypatch.setattr("huggingface_hub.constants.HF_HUB_CACHE", str(tmp_path))
     repository = tmp_path / "models--someone--small-vl"
@@ -327,7 +271,7 @@ def test_a_cached_hub_copy_is_used_without_network(
         weight_files(resolve_checkpoint("someone/small-vl"))
 
 
-def test_only_what_transformers_loads_is_digested(tmp_path: Path, demo_checkpoint: Path) -> None:
+def test_only_what_transformers_loads_is_digested(tmp_path, demo_checkpoint):
     folder = tmp_path / "vlm"
     shutil.copytree(demo_checkpoint, folder)
     whole, shard = folder / "model.safetensors", folder / "model-00001-of-00001.safetensors"
@@ -340,43 +284,25 @@ def test_only_what_transformers_loads_is_digested(tmp_path: Path, demo_checkpoin
         weight_files(folder)
     whole.unlink()
     assert weight_files(folder) == sorted([folder / "config.json", shard, index])
-
-
-def test_an_adapter_inside_a_checkpoint_is_refused(tmp_path: Path, demo_checkpoint: Path) -> None:
-    folder = tmp_path / "vlm"
-    shutil.copytree(demo_checkpoint, folder)
     (folder / "adapter_config.json").write_text("{}")
     with pytest.raises(VLMError, match=r"adapter_config\.json.*name that as vlm\.adapter"):
         weight_files(folder)
 
 
-def test_importing_the_spec_imports_neither_torch_nor_transformers() -> None:
-    code = (
-        "import sys, pipeline.vlm.feature_spec;"
-        "print(sorted({'torch', 'transformers', 'peft'} & set(sys.modules)))"
-    )
-    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert found.stdout.strip() == "[]"
-
-
 def test_what_transformers_read_is_remembered_by_all_it_depends_on(
-    vlm_params: Callable[..., VLMParams],
-    digest_file: Callable[[Path], str],
-    demo_checkpoint: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+    vlm_params, digest_file, demo_checkpoint, tmp_path, monkeypatch
+):
     folder = shutil.copytree(demo_checkpoint, tmp_path / "checkpoint")
     kept: dict[str, str] = {}
     made: list[str] = []
 
-    def remember(what: str, make: Callable[[], str]) -> str:
+    def remember(what, make):
         if what not in kept:
             made.append(what)
             kept[what] = make()
         return kept[what]
 
-    def spec(views: tuple[str, ...] = VIEWS, **changes: object) -> FeatureSpec:
+    def spec(views=VIEWS, **changes):
         vlm = vlm_params(checkpoint=str(folder), **changes)
         again = feature_spec(vlm, "float32", views, digest_file, remember)
         assert again == feature_spec(vlm, "float32", views, digest_file)

@@ -6,13 +6,10 @@ After a change that is meant: raise `EXTRACTOR_VERSION` in pipeline/vlm/feature_
 
 import json
 import os
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from pipeline.vlm.feature_spec import EXTRACTOR_VERSION
 
@@ -22,9 +19,7 @@ SHOWN = 4
 POOLINGS = ["mean", "image_mean", "text_mean", "view_mean", "last"]
 
 
-def _features(
-    extractor: Callable[..., Any], make_frame: Callable[..., NDArray[np.uint8]]
-) -> dict[str, list[float]]:
+def _features(extractor, make_frame):
     views = ("View1", "View2")
     frames = {view: make_frame(seed, 120, 160) for seed, view in enumerate(views)}
     jobs = [
@@ -45,22 +40,20 @@ def _features(
     return shown
 
 
-def _write(features: dict[str, list[float]]) -> None:
+def _write(features):
     lines = ",\n".join(f"    {json.dumps(name)}: {values}" for name, values in features.items())
     GOLDEN.write_text(
         f'{{\n  "extractor_version": {EXTRACTOR_VERSION},\n  "features": {{\n{lines}\n  }}\n}}\n'
     )
 
 
-def _largest_difference(a: dict[str, list[float]], b: dict[str, list[float]]) -> float:
+def _largest_difference(a, b):
     if a.keys() != b.keys():
         return float("inf")
     return max(float(np.abs(np.subtract(a[key], b[key])).max()) for key in a)
 
 
-def test_features_are_those_of_this_extractor_version(
-    extractor: Callable[..., Any], make_frame: Callable[..., NDArray[np.uint8]]
-) -> None:
+def test_features_are_those_of_this_extractor_version(extractor, make_frame):
     features = _features(extractor, make_frame)
     golden = json.loads(GOLDEN.read_text()) if GOLDEN.exists() else None
     moved = golden is None or _largest_difference(features, golden["features"]) > 2e-3

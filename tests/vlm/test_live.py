@@ -3,14 +3,10 @@
 import copy
 import json
 import shutil
-from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 import torch
-from numpy.typing import NDArray
 from safetensors.torch import load_file
 from torch import Tensor
 from transformers import Qwen2_5_VLForConditionalGeneration
@@ -26,7 +22,7 @@ BF16_TOLERANCE = 0.06
 
 
 @pytest.fixture(scope="module")
-def jobs(make_frame: Callable[..., NDArray[np.uint8]]) -> list[tuple[str, dict[str, Any]]]:
+def jobs(make_frame):
     """Rows of different length and views, one without any."""
     frames = {view: make_frame(seed) for seed, view in enumerate(("View1", "View2", "View3"))}
     return [
@@ -37,11 +33,11 @@ def jobs(make_frame: Callable[..., NDArray[np.uint8]]) -> list[tuple[str, dict[s
 
 
 @pytest.fixture(scope="module")
-def prepare(extractor: Callable[..., Any], jobs: list[Any]) -> Callable[..., Any]:
+def prepare(extractor, jobs):
     """The frozen extractor of some params, its rows and their features; made once each."""
     made: dict[str, tuple[Any, list[PreparedRow], Tensor]] = {}
 
-    def make(*args: Any, **changes: Any) -> tuple[Any, list[PreparedRow], Tensor]:
+    def make(*args, **changes):
         asked = repr((args, changes))
         if asked not in made:
             frozen = extractor(*args, **(POOLING | changes))
@@ -52,12 +48,12 @@ def prepare(extractor: Callable[..., Any], jobs: list[Any]) -> Callable[..., Any
     return make
 
 
-def _live(frozen: Any, **tuning: Any) -> LiveVLM:
+def _live(frozen, **tuning):
     torch.manual_seed(0)
     return LiveVLM.load(frozen.vlm, frozen.spec, TuningParams(**tuning), "cpu")
 
 
-def _stir(live: LiveVLM, strength: float = 0.05) -> None:
+def _stir(live, strength=0.05):
     """Move what learns, as a training would: adapters begin as zero."""
     generator = torch.Generator().manual_seed(1)
     with torch.no_grad():
@@ -66,11 +62,11 @@ def _stir(live: LiveVLM, strength: float = 0.05) -> None:
             parameter += scale * torch.randn(parameter.shape, generator=generator)
 
 
-def _learning(live: LiveVLM) -> dict[str, torch.nn.Parameter]:
+def _learning(live):
     return {name: p for name, p in live.named_parameters() if p.requires_grad}
 
 
-def _gradients(live: LiveVLM, rows: list[PreparedRow]) -> dict[str, Tensor]:
+def _gradients(live, rows):
     torch.manual_seed(3)
     features, _ = live(rows)
     weights = torch.randn(features.shape, generator=torch.Generator().manual_seed(2))
@@ -83,14 +79,12 @@ def _gradients(live: LiveVLM, rows: list[PreparedRow]) -> dict[str, Tensor]:
     return found
 
 
-def _relative(a: Tensor, b: Tensor) -> Tensor:
+def _relative(a, b):
     return (a - b).norm(dim=-1) / b.norm(dim=-1).clamp(min=1e-6)
 
 
 @pytest.mark.parametrize("method", ["none", "lora", "full"])
-def test_an_untrained_live_model_is_the_frozen_one(
-    prepare: Callable[..., Any], method: str
-) -> None:
+def test_an_untrained_live_model_is_the_frozen_one(prepare, method):
     frozen, rows, expected = prepare(layers=[-1, 1], norms=[True, False])
     live = _live(frozen, method=method).eval()
     features, valid = live(rows)
@@ -100,8 +94,8 @@ def test_an_untrained_live_model_is_the_frozen_one(
     assert bool(_learning(live)) == (method != "none")
 
 
-@pytest.mark.parametrize("method", ["none", "lora", "full"])
-def test_bfloat16_agrees_within_its_noise(prepare: Callable[..., Any], method: str) -> None:
+@pytest.mark.parametrize("method", ["lora", "full"])
+def test_bfloat16_agrees_within_its_noise(prepare, method):
     frozen, rows, expected = prepare("bfloat16", dtype="bfloat16")
     live = _live(frozen, method=method).eval()
     features, valid = live(rows)
@@ -116,14 +110,10 @@ def test_bfloat16_agrees_within_its_noise(prepare: Callable[..., Any], method: s
     ("tuning", "towers"),
     [
         ({"method": "lora"}, {"language_model", "visual"}),
-        ({"method": "lora", "towers": ["vision"]}, {"visual"}),
-        ({"method": "full"}, {"language_model", "visual"}),
         ({"method": "full", "towers": ["language"]}, {"language_model"}),
     ],
 )
-def test_gradients_reach_all_that_learns_with_checkpointing_or_without(
-    prepare: Callable[..., Any], tuning: dict[str, Any], towers: set[str]
-) -> None:
+def test_gradients_reach_all_that_learns_with_checkpointing_or_without(prepare, tuning, towers):
     frozen, rows, _ = prepare(layers=[2])
     found = []
     for checkpointing in (True, False):
@@ -138,7 +128,7 @@ def test_gradients_reach_all_that_learns_with_checkpointing_or_without(
         torch.testing.assert_close(gradient, found[1][name], atol=1e-5, rtol=1e-4)
 
 
-def test_checkpointing_recomputes_blocks_in_the_backward_pass(prepare: Callable[..., Any]) -> None:
+def test_checkpointing_recomputes_blocks_in_the_backward_pass(prepare):
     frozen, rows, _ = prepare()
     runs = {}
     for checkpointing in (True, False):
@@ -153,7 +143,7 @@ def test_checkpointing_recomputes_blocks_in_the_backward_pass(prepare: Callable[
     assert runs == {True: 2, False: 1}
 
 
-def test_lora_stands_on_every_linear_layer_that_runs(prepare: Callable[..., Any]) -> None:
+def test_lora_stands_on_every_linear_layer_that_runs(prepare):
     frozen, _, _ = prepare(layers=[1])
     live = _live(frozen, lora_r=3)
     names = {name.partition(".lora_")[0] for name in _learning(live)}
@@ -169,10 +159,8 @@ def test_lora_stands_on_every_linear_layer_that_runs(prepare: Callable[..., Any]
     assert all(3 in parameter.shape for parameter in _learning(live).values())
 
 
-@pytest.mark.parametrize("dtype", ["float32", "bfloat16"])
-def test_a_saved_adapter_makes_the_frozen_model_the_live_one(
-    prepare: Callable[..., Any], tmp_path: Path, dtype: str
-) -> None:
+@pytest.mark.parametrize("dtype", ["float32", pytest.param("bfloat16", marks=pytest.mark.slow)])
+def test_a_saved_adapter_makes_the_frozen_model_the_live_one(prepare, tmp_path, dtype):
     frozen, rows, before = prepare(dtype, dtype=dtype, layers=[2])
     live = _live(frozen, lora_r=4, lora_alpha=8)
     _stir(live)
@@ -198,7 +186,7 @@ def test_a_saved_adapter_makes_the_frozen_model_the_live_one(
         assert moved > 2 * _relative(features, after.float())[valid].mean()
 
 
-def test_the_same_adapter_is_the_same_file(prepare: Callable[..., Any], tmp_path: Path) -> None:
+def test_the_same_adapter_is_the_same_file(prepare, tmp_path):
     frozen, _, _ = prepare()
     for name in ("one", "two"):
         _live(frozen).save(tmp_path / name)
@@ -207,7 +195,7 @@ def test_the_same_adapter_is_the_same_file(prepare: Callable[..., Any], tmp_path
         assert first == second
 
 
-def test_tuning_goes_on_from_an_adapter(prepare: Callable[..., Any], tmp_path: Path) -> None:
+def test_tuning_goes_on_from_an_adapter(prepare, tmp_path):
     whole, _, _ = prepare()
     first = _live(whole, lora_r=4, lora_alpha=8)
     _stir(first)
@@ -235,9 +223,7 @@ def test_tuning_goes_on_from_an_adapter(prepare: Callable[..., Any], tmp_path: P
         _live(blind, lora_r=4, lora_alpha=8)
 
 
-def test_full_saves_a_complete_checkpoint(
-    prepare: Callable[..., Any], demo_checkpoint: Path, tmp_path: Path
-) -> None:
+def test_full_saves_a_complete_checkpoint(prepare, demo_checkpoint, tmp_path):
     adapted = _live(prepare()[0], lora_r=4, lora_alpha=8)
     _stir(adapted)
     adapted.save(tmp_path / "adapter")
@@ -264,9 +250,7 @@ def test_full_saves_a_complete_checkpoint(
         torch.testing.assert_close(one, other)
 
 
-def test_full_keeps_the_dtype_of_its_base(
-    prepare: Callable[..., Any], demo_checkpoint: Path, tmp_path: Path
-) -> None:
+def test_full_keeps_the_dtype_of_its_base(prepare, demo_checkpoint, tmp_path):
     base = shutil.copytree(demo_checkpoint, tmp_path / "base")
     model = Qwen2_5_VLForConditionalGeneration.from_pretrained(base, dtype=torch.bfloat16)
     model.save_pretrained(base)
@@ -281,8 +265,8 @@ def test_full_keeps_the_dtype_of_its_base(
     assert _relative(features, again.float())[valid].max() < BF16_TOLERANCE
 
 
-@pytest.mark.parametrize("method", ["none", "lora", "full"])
-def test_a_copy_shares_what_is_frozen(prepare: Callable[..., Any], method: str) -> None:
+@pytest.mark.parametrize("method", ["lora", "full"])
+def test_a_copy_shares_what_is_frozen(prepare, method):
     frozen, rows, _ = prepare()
     live = _live(frozen, method=method).eval()
     memo = {id(p): p for p in live.parameters() if not p.requires_grad}
@@ -295,12 +279,10 @@ def test_a_copy_shares_what_is_frozen(prepare: Callable[..., Any], method: str) 
     assert torch.equal(twin(rows)[0], before)
     _stir(twin)
     assert torch.equal(live(rows)[0], before)
-    assert method == "none" or (twin(rows)[0] - before).abs().max() > 1e-3
+    assert (twin(rows)[0] - before).abs().max() > 1e-3
 
 
-def test_none_saves_nothing_and_float16_does_not_learn(
-    prepare: Callable[..., Any], tmp_path: Path
-) -> None:
+def test_none_saves_nothing_and_float16_does_not_learn(prepare, tmp_path):
     frozen, _, _ = prepare()
     _live(frozen, method="none").save(tmp_path / "nothing")
     assert not (tmp_path / "nothing").exists()

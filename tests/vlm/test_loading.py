@@ -5,13 +5,10 @@ import json
 import shutil
 from collections.abc import Callable
 from contextlib import suppress
-from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 import torch
-from numpy.typing import NDArray
 from peft import LoraConfig, PeftModel, get_peft_model
 from safetensors.torch import load_file, save_file
 from torch import Tensor
@@ -29,11 +26,11 @@ Encode = Callable[..., Tensor]
 
 
 @pytest.fixture(scope="module")
-def encode(extractor: Callable[..., Any], make_frame: Callable[..., NDArray[np.uint8]]) -> Encode:
+def encode(extractor, make_frame):
     """Features of one row under changed params."""
     frames = {view: make_frame(seed) for seed, view in enumerate(("View1", "View2", "View3"))}
 
-    def features(**changes: object) -> Tensor:
+    def features(**changes):
         ours = extractor(pooling=["mean", "view_mean"], **changes)
         return ours.model.encode([ours.preparer.prepare("insert the needle", frames)])[0]
 
@@ -41,22 +38,22 @@ def encode(extractor: Callable[..., Any], make_frame: Callable[..., NDArray[np.u
 
 
 @pytest.fixture
-def copy(demo_checkpoint: Path, tmp_path: Path) -> Path:
+def copy(demo_checkpoint, tmp_path):
     return shutil.copytree(demo_checkpoint, tmp_path / "copy")
 
 
-def _rewrite(folder: Path, change: Callable[[dict[str, Tensor]], dict[str, Tensor]]) -> None:
+def _rewrite(folder, change):
     path = folder / "model.safetensors"
     weights = {name: tensor.contiguous() for name, tensor in change(load_file(path)).items()}
     save_file(weights, path, metadata={"format": "pt"})
 
 
-def _with_head(weights: dict[str, Tensor]) -> dict[str, Tensor]:
+def _with_head(weights):
     return weights | {"lm_head.weight": weights["model.embed_tokens.weight"].clone()}
 
 
-def _newer_names(weights: dict[str, Tensor]) -> dict[str, Tensor]:
-    def rename(name: str) -> str:
+def _newer_names(weights):
+    def rename(name):
         if name.startswith("visual."):
             return f"model.{name}"
         return name.replace("model.", "model.language_model.", 1)
@@ -64,9 +61,7 @@ def _newer_names(weights: dict[str, Tensor]) -> dict[str, Tensor]:
     return {rename(name): tensor for name, tensor in weights.items()}
 
 
-def test_original_and_newer_naming_load_the_same(
-    encode: Encode, demo_checkpoint: Path, copy: Path
-) -> None:
+def test_original_and_newer_naming_load_the_same(encode, demo_checkpoint, copy):
     base = encode()
     original = set(load_file(demo_checkpoint / "model.safetensors"))
     assert "visual.blocks.0.attn.qkv.weight" in original
@@ -75,18 +70,14 @@ def test_original_and_newer_naming_load_the_same(
         shutil.copy(demo_checkpoint / "model.safetensors", copy / "model.safetensors")
         _rewrite(copy, change)
         assert torch.equal(encode(checkpoint=str(copy)), base)
-
-
-def test_an_untied_head_is_not_needed(encode: Encode, copy: Path) -> None:
-    base = encode()
+    shutil.copy(demo_checkpoint / "model.safetensors", copy / "model.safetensors")
     config = json.loads((copy / "config.json").read_text())
-    config["tie_word_embeddings"] = False
-    config["text_config"]["tie_word_embeddings"] = False
+    config["tie_word_embeddings"] = config["text_config"]["tie_word_embeddings"] = False
     (copy / "config.json").write_text(json.dumps(config))
-    assert torch.equal(encode(checkpoint=str(copy)), base)
+    assert torch.equal(encode(checkpoint=str(copy)), base), "an untied head is not needed"
 
 
-def test_the_hubs_flat_config_and_shards_load_the_same(encode: Encode, copy: Path) -> None:
+def test_the_hubs_flat_config_and_shards_load_the_same(encode, copy):
     base = encode()
     config = json.loads((copy / "config.json").read_text())
     text = config.pop("text_config")
@@ -115,15 +106,15 @@ def test_the_hubs_flat_config_and_shards_load_the_same(encode: Encode, copy: Pat
         encode(checkpoint=str(copy))
 
 
-def _without_a_layer(weights: dict[str, Tensor]) -> dict[str, Tensor]:
+def _without_a_layer(weights):
     return {name: tensor for name, tensor in weights.items() if ".layers.2.mlp." not in name}
 
 
-def _with_a_stranger(weights: dict[str, Tensor]) -> dict[str, Tensor]:
+def _with_a_stranger(weights):
     return weights | {"visual.blocks.9.norm1.weight": torch.ones(128)}
 
 
-def _narrower(weights: dict[str, Tensor]) -> dict[str, Tensor]:
+def _narrower(weights):
     return weights | {"model.norm.weight": torch.ones(64)}
 
 
@@ -138,20 +129,14 @@ def _narrower(weights: dict[str, Tensor]) -> dict[str, Tensor]:
         ),
     ],
 )
-def test_no_weight_is_ever_random(
-    encode: Encode,
-    copy: Path,
-    change: Callable[[dict[str, Tensor]], dict[str, Tensor]],
-    message: str,
-    capfd: pytest.CaptureFixture[str],
-) -> None:
+def test_no_weight_is_ever_random(encode, copy, change, message, capfd):
     _rewrite(copy, change)
     with pytest.raises(VLMError, match=message):
         encode(checkpoint=str(copy))
     assert not capfd.readouterr().err
 
 
-def test_damaged_folders_are_named(encode: Encode, copy: Path) -> None:
+def test_damaged_folders_are_named(encode, copy):
     weights = (copy / "model.safetensors").read_bytes()
     (copy / "model.safetensors").write_bytes(weights[:-1000])
     with pytest.raises(VLMError, match=r"model\.safetensors: cut off or damaged"):
@@ -162,15 +147,12 @@ def test_damaged_folders_are_named(encode: Encode, copy: Path) -> None:
     (copy / "preprocessor_config.json").unlink()
     with pytest.raises(VLMError, match="preprocessor_config"):
         encode(checkpoint=str(copy))
-    (copy / "config.json").write_text('{"model_type": "llama"}')
-    with pytest.raises(VLMError, match="model_type: expected 'qwen2_5_vl', found 'llama'"):
-        encode(checkpoint=str(copy))
     (copy / "config.json").write_text("{")
     with pytest.raises(VLMError, match="cannot be read as JSON"):
         encode(checkpoint=str(copy))
 
 
-def _add(path: Path, entries: dict[str, Any]) -> None:
+def _add(path, entries):
     document = json.loads(path.read_text()) if path.exists() else {}
     path.write_text(json.dumps(document | entries))
 
@@ -207,13 +189,8 @@ raise SystemExit("code of the checkpoint ran")
     ],
 )
 def test_code_of_a_checkpoint_never_runs_whatever_is_answered(
-    encode: Encode,
-    copy: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    name: str,
-    entries: dict[str, Any],
-) -> None:
+    encode, copy, tmp_path, monkeypatch, name, entries
+):
     marker = tmp_path / "ran"
     (copy / "evil.py").write_text(EVIL.format(marker=str(marker)))
     _add(copy / name, entries)
@@ -237,29 +214,23 @@ def test_code_of_a_checkpoint_never_runs_whatever_is_answered(
         encode(checkpoint=str(copy))
 
 
-def _as_integers(weights: dict[str, Tensor]) -> dict[str, Tensor]:
+def _as_integers(weights):
     name = "model.layers.1.mlp.down_proj.weight"
     return weights | {name: (weights[name] * 100).to(torch.int8)}
 
 
-@pytest.mark.parametrize("quantization", [{"quant_method": "zip"}, {"load_in_8bit": True}])
-def test_a_quantized_checkpoint_is_refused_before_it_is_loaded(
-    encode: Encode, copy: Path, quantization: dict[str, Any]
-) -> None:
-    _add(copy / "config.json", {"quantization_config": quantization})
-    with pytest.raises(VLMError, match=rf"config\.json.*bfloat16.*{next(iter(quantization))}"):
-        encode(checkpoint=str(copy))
-
-
-def test_weights_that_are_no_floats_are_refused(encode: Encode, copy: Path) -> None:
+def test_weights_that_are_no_floats_are_refused(encode, copy):
     _rewrite(copy, _as_integers)
     with pytest.raises(VLMError, match=r"model\.safetensors.*1 of .*layers\.1\.mlp.*of I8"):
         encode(checkpoint=str(copy))
     _rewrite(copy, lambda weights: {name: one.half() for name, one in weights.items()})
     encode(checkpoint=str(copy))
+    _add(copy / "config.json", {"quantization_config": {"load_in_8bit": True}})
+    with pytest.raises(VLMError, match=r"config\.json.*bfloat16.*load_in_8bit"):
+        encode(checkpoint=str(copy))
 
 
-def test_what_this_machine_cannot_do_is_said(extractor: Callable[..., Any], encode: Encode) -> None:
+def test_what_this_machine_cannot_do_is_said(extractor, encode):
     with pytest.raises(VLMError, match="flash_attention_2 needs CUDA"):
         encode(attention="flash_attention_2")
     ours = extractor()
@@ -270,8 +241,8 @@ def test_what_this_machine_cannot_do_is_said(extractor: Callable[..., Any], enco
 
 
 @pytest.fixture(scope="module")
-def make_adapter(demo_checkpoint: Path) -> Callable[..., Path]:
-    def make(folder: Path, strength: float, targets: str | list[str] = "all-linear") -> Path:
+def make_adapter(demo_checkpoint):
+    def make(folder, strength, targets="all-linear"):
         base = Qwen2_5_VLForConditionalGeneration.from_pretrained(demo_checkpoint)
         config = LoraConfig(r=4, lora_alpha=8, target_modules=targets)
         adapted: Any = get_peft_model(base, config)
@@ -286,12 +257,7 @@ def make_adapter(demo_checkpoint: Path) -> Callable[..., Path]:
     return make
 
 
-def test_an_adapter_changes_features_and_identity(
-    encode: Encode,
-    extractor: Callable[..., Any],
-    make_adapter: Callable[..., Path],
-    tmp_path: Path,
-) -> None:
+def test_an_adapter_changes_features_and_identity(encode, extractor, make_adapter, tmp_path):
     base = encode()
     nothing = make_adapter(tmp_path / "zeros", 0.0)
     torch.testing.assert_close(encode(adapter=str(nothing)), base)
@@ -302,12 +268,7 @@ def test_an_adapter_changes_features_and_identity(
     assert len(digests) == 3
 
 
-def test_an_adapter_is_what_peft_makes_of_it(
-    extractor: Callable[..., Any],
-    make_adapter: Callable[..., Path],
-    demo_checkpoint: Path,
-    tmp_path: Path,
-) -> None:
+def test_an_adapter_is_what_peft_makes_of_it(extractor, make_adapter, demo_checkpoint, tmp_path):
     folder = make_adapter(tmp_path / "lora", 0.1, ["q_proj", "v_proj"])
     ours = extractor(adapter=str(folder), pooling=["last"])
     row = ours.preparer.prepare("insert the needle", {})
@@ -319,9 +280,7 @@ def test_an_adapter_is_what_peft_makes_of_it(
     torch.testing.assert_close(ours.model.encode([row])[0][0, 0], expected, atol=1e-4, rtol=1e-4)
 
 
-def test_an_adapter_that_does_not_fit_is_refused(
-    encode: Encode, make_adapter: Callable[..., Path], tmp_path: Path
-) -> None:
+def test_an_adapter_that_does_not_fit_is_refused(encode, make_adapter, tmp_path):
     folder = make_adapter(tmp_path / "adapter", 0.1)
     weights = folder / "adapter_model.safetensors"
     config = json.loads((folder / "adapter_config.json").read_text())
@@ -338,10 +297,6 @@ def test_an_adapter_that_does_not_fit_is_refused(
     (folder / "adapter_config.json").write_text(json.dumps(config | {"r": 8}))
     with pytest.raises(VLMError, match="does not fit"):
         encode(adapter=str(folder))
-    strange = config | {"target_modules": ["nowhere_proj"]}
-    (folder / "adapter_config.json").write_text(json.dumps(strange))
-    with pytest.raises(VLMError, match="does not fit"):
-        encode(adapter=str(folder))
     weights.unlink()
     with pytest.raises(VLMError, match=r"adapter_model\.safetensors: no such file"):
         encode(adapter=str(folder))
@@ -351,25 +306,13 @@ def test_an_adapter_that_does_not_fit_is_refused(
     ("key", "value", "told"),
     [
         ("peft_type", "OWN", "peft_type: expected 'LORA', found 'OWN'"),
-        ("peft_type", "XLORA", "peft_type: expected 'LORA', found 'XLORA'"),
         ("lora_alpha", float("nan"), "cannot be merged: ValueError: NaNs detected"),
         ("target_modules", "((", "does not fit the checkpoint .*unterminated"),
-        ("target_modules", 5, "does not fit the checkpoint .*TypeError"),
-        ("target_modules", ["nowhere"], "does not fit the checkpoint .*nowhere"),
         ("megatron_config", {"a": 1}, "megatron_config: expected null"),
         ("arrow_config", {"a": 1}, "arrow_config: expected null"),
-        ("trainable_token_indices", [10**9], "does not fit the checkpoint .*IndexError"),
-        ("alora_invocation_tokens", [1], "cannot be merged: NotImplementedError"),
     ],
 )
-def test_what_an_adapter_may_not_say(
-    encode: Encode,
-    make_adapter: Callable[..., Path],
-    tmp_path: Path,
-    key: str,
-    value: object,
-    told: str,
-) -> None:
+def test_what_an_adapter_may_not_say(encode, make_adapter, tmp_path, key, value, told):
     folder = make_adapter(tmp_path / "adapter", 0.1)
     _add(folder / "adapter_config.json", {key: value})
     mend = r"Set vlm\.adapter to a LoRA adapter of this checkpoint"
@@ -377,13 +320,13 @@ def test_what_an_adapter_may_not_say(
         encode(adapter=str(folder))
 
 
-def test_a_tensor_stands_once(encode: Encode, copy: Path) -> None:
+def test_a_tensor_stands_once(encode, copy):
     _rewrite(copy, lambda weights: weights | _newer_names({"model.norm.weight": torch.ones(128)}))
     with pytest.raises(VLMError, match="a tensor stands there by two names"):
         encode(checkpoint=str(copy))
 
 
-def test_a_config_of_other_weights_is_refused(encode: Encode, copy: Path) -> None:
+def test_a_config_of_other_weights_is_refused(encode, copy):
     config = json.loads((copy / "config.json").read_text())
     text = config["text_config"]
     for entries, told in (

@@ -1,30 +1,25 @@
 """Pixels are those of transformers' own image processor."""
 
-from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from numpy.typing import NDArray
 from transformers import AutoImageProcessor
 
 from pipeline.base.errors import VLMError
-from pipeline.vlm.extractor import patchify
 from pipeline.vlm.processor import PixelSettings, stretch
+from pipeline.vlm.qwen import patchify
 
 
-def test_the_seeds_resize_gives_364_by_644(demo_checkpoint: Path) -> None:
+def test_the_seeds_resize_gives_364_by_644(demo_checkpoint):
     settings = PixelSettings.read(demo_checkpoint, (360, 640))
     assert settings.image_size == (364, 644)
     assert settings.grid == (26, 46)
     assert settings.merged_grid == (13, 23)
 
 
-def test_patches_equal_the_image_processor(
-    demo_checkpoint: Path, make_frame: Callable[..., NDArray[np.uint8]]
-) -> None:
+def test_patches_equal_the_image_processor(demo_checkpoint, make_frame):
     frames = [make_frame(seed, 360, 640) for seed in range(2)]
     settings = PixelSettings.read(demo_checkpoint, (360, 640))
     stretched = np.stack([stretch(frame, settings.image_size) for frame in frames])
@@ -39,12 +34,12 @@ def test_patches_equal_the_image_processor(
     )
 
 
-def test_another_aspect_is_stretched_once(make_frame: Callable[..., NDArray[np.uint8]]) -> None:
+def test_another_aspect_is_stretched_once(make_frame):
     frame = make_frame(3, 90, 300)
     assert stretch(frame, (112, 140)).shape == (112, 140, 3)
     assert np.array_equal(stretch(frame, (90, 300)), frame)
 
 
-def test_a_size_past_the_processors_limits_is_refused(demo_checkpoint: Path) -> None:
+def test_a_size_past_the_processors_limits_is_refused(demo_checkpoint):
     with pytest.raises(VLMError, match="image_resize_height"):
         PixelSettings.read(demo_checkpoint, (28, 28000))

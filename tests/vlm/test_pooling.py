@@ -17,9 +17,7 @@ from pipeline.vlm.slots import Slot, slots_of
     columns=st.integers(1, 24),
     start=st.integers(0, 5),
 )
-def test_grid_is_adaptive_average_pooling(
-    grid: tuple[int, int], rows: int, columns: int, start: int
-) -> None:
+def test_grid_is_adaptive_average_pooling(grid, rows, columns, start):
     vlm = VLMParams(checkpoint="any", pooling=("grid",), grid=grid)
     slots = slots_of(vlm, 1, ["View1"])
     assert [slot.cell for slot in slots] == list(np.ndindex(*grid))
@@ -35,7 +33,7 @@ def test_grid_is_adaptive_average_pooling(
     grid=st.tuples(st.integers(1, 5), st.integers(1, 5)),
     present=st.sets(st.sampled_from(["View1", "View2"])),
 )
-def test_weights_sum_to_one_or_to_nothing(grid: tuple[int, int], present: set[str]) -> None:
+def test_weights_sum_to_one_or_to_nothing(grid, present):
     size = grid[0] * grid[1]
     starts = tuple((view, 2 + i * (size + 2)) for i, view in enumerate(sorted(present)))
     layout = TokenLayout(4 + len(starts) * (size + 2), starts, grid)
@@ -52,7 +50,7 @@ def test_weights_sum_to_one_or_to_nothing(grid: tuple[int, int], present: set[st
     torch.testing.assert_close(sums, torch.tensor(expected, dtype=torch.float32))
 
 
-def test_padding_never_enters_even_when_it_is_infinite() -> None:
+def test_padding_never_enters_even_when_it_is_infinite():
     layouts = [TokenLayout(3, (), (1, 1)), TokenLayout(5, (), (1, 1))]
     slots = (Slot(0, True, "mean"), Slot(0, True, "last"))
     hidden = torch.randn(2, 5, 4, dtype=torch.float32).to(torch.bfloat16)
