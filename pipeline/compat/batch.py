@@ -10,7 +10,7 @@ from torch import Tensor
 
 from pipeline.base.errors import StoreMismatch
 from pipeline.data.episode import Frames
-from pipeline.store.gather import Batch
+from pipeline.store import Batch
 
 Sample = Mapping[str, Any]
 """One tick: the fields of `UnifiedBatch` by name, without their batch axis."""

@@ -18,8 +18,7 @@ from pipeline.evaluate.figures import Figure, times
 from pipeline.policy.checkpoint import PolicyCheckpoint
 from pipeline.policy.observation import VALIDITY, stream_of
 from pipeline.policy.policy import Policy
-from pipeline.store import FeatureStore, episode_name
-from pipeline.store.gather import Batch
+from pipeline.store import Batch, FeatureStore, episode_name
 from pipeline.train.batches import NO_LAGS, BatchIndices, Lags, Prefetch, Ticks, Windows, evenly
 from pipeline.train.predictions import FeedMaker, predict
 from pipeline.train.scores import Comparison, action_space, compare

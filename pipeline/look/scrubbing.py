@@ -132,7 +132,7 @@ class _Log:
         time: NDArray[np.float64],
         values: NDArray[np.float32],
     ) -> None:
-        """Curves of a stream (reading, channel); a wide one has one curve, and images of the rest."""
+        """Curves of a stream (reading, channel); a wide one has a curve, and images of the rest."""
         if len(channels) <= _MOST_CURVES:
             self.curves(name, channels, time, values)
             return

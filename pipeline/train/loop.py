@@ -20,8 +20,7 @@ from pipeline.policy.checkpoint import PolicyCheckpoint, save_policy
 from pipeline.policy.cost import describe_cost
 from pipeline.policy.observation import moving_channels
 from pipeline.policy.policy import Policy, Trainable
-from pipeline.store import FeatureStore
-from pipeline.store.gather import Batch
+from pipeline.store import Batch, FeatureStore
 from pipeline.train.batches import BatchIndices, Windows, choose_feed, evenly
 from pipeline.train.checkpoints import load_weights, of_kind, read_last, write_trainer
 from pipeline.train.feature_source import FeatureSource

@@ -14,8 +14,7 @@ from tqdm import tqdm
 from pipeline.base.arrays import first_non_finite
 from pipeline.base.errors import NumericsError
 from pipeline.policy.policy import Trainable
-from pipeline.store import FeatureStore, place
-from pipeline.store.gather import Batch
+from pipeline.store import Batch, FeatureStore, place
 from pipeline.train.batches import BatchIndices, Prefetch, Ticks, Windows, cut_batches
 
 Actions = NDArray[np.float32]

@@ -25,7 +25,6 @@ from pipeline.vlm.loading import environment, load_model
 from pipeline.vlm.pooling import pool
 from pipeline.vlm.preparation import PreparedRow, TokenLayout
 from pipeline.vlm.processor import PixelSettings
-from pipeline.vlm.qwen import Extractor, layers_needed
 from pipeline.vlm.slots import Slot
 from pipeline.vlm.vision import VisionTower
 

@@ -25,8 +25,7 @@ from pipeline.datasets import (
     async_collate_fn_with_sensor,
     unified_collate_fn,
 )
-from pipeline.store import FeatureStore
-from pipeline.store.gather import Batch
+from pipeline.store import Batch, FeatureStore
 from pipeline.train.split import split_by_episode
 
 SMALL = TrainHeadParams.model_validate(

@@ -10,9 +10,8 @@ import pytest
 import zarr
 
 from pipeline.base.config import TrainHeadParams
-from pipeline.store import FeatureStore
+from pipeline.store import Batch, FeatureStore
 from pipeline.store.chunks import write_seal
-from pipeline.store.gather import Batch
 from pipeline.train.batches import BatchIndices
 from pipeline.train.loop import Trainer
 from pipeline.train.run import open_run

@@ -12,8 +12,7 @@ import pytest
 import torch
 
 from pipeline.base.config import TrainHeadParams
-from pipeline.store import FeatureStore
-from pipeline.store.gather import Batch
+from pipeline.store import Batch, FeatureStore
 from pipeline.train.batches import BatchIndices, Lags, Prefetch, Windows, cut_batches, evenly
 
 CPU = torch.device("cpu")

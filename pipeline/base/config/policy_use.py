@@ -1,4 +1,4 @@
-"""Sections for the use of a trained policy: evaluate, roll out, serve, drive, export, push, limit."""
+"""Sections for the use of a trained policy: evaluate, roll out, serve, drive, export, push."""
 
 from collections.abc import Sequence
 from pathlib import Path

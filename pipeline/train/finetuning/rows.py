@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 from pipeline.data import Recording
 from pipeline.data.episode import RowFrames, by_episode
 from pipeline.policy.observation import LiveObservation
-from pipeline.store import FeatureStore
-from pipeline.store.gather import Batch
+from pipeline.store import Batch, FeatureStore
 from pipeline.train.batches import BatchIndices, Prefetch, Windows
 from pipeline.vlm.preparation import PreparedRow, Preparer
 

@@ -13,8 +13,7 @@ import torch
 from pipeline.base.config import TuningParams
 from pipeline.base.errors import RecordingError
 from pipeline.policy.observation import LiveObservation
-from pipeline.store import FeatureStore
-from pipeline.store.gather import Batch
+from pipeline.store import Batch, FeatureStore
 from pipeline.train.batches import BatchIndices, Windows
 from pipeline.train.finetuning.recordings import check_spec, find_recordings, known_digests
 from pipeline.train.finetuning.rows import LiveFeed, LiveRows
