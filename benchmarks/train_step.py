@@ -21,11 +21,10 @@ from benchmarks.flops import peak_flops
 from benchmarks.stores import write_store
 from benchmarks.timing import Work, arguments, at_least, at_most, race, report
 from pipeline.base.config import TrainHeadParams, load_params
-from pipeline.policy.cost import flop_table
-from pipeline.store import FeatureStore
+from pipeline.policy.policy import flop_table
+from pipeline.store import Batch, FeatureStore
 from pipeline.store.gather import WIDE, Batch
-from pipeline.train.batches import BatchIndices, Prefetch, Windows
-from pipeline.train.feature_source import FeatureSource
+from pipeline.train.batches import BatchIndices, FeatureSource, Prefetch, Windows
 from pipeline.train.loop import Trainer
 from pipeline.train.run import TrainingRun
 from pipeline.train.split import split_by_episode

@@ -11,7 +11,7 @@ import torch
 
 from pipeline.base.config import RolloutAblation
 from pipeline.base.observation import Observation
-from pipeline.policy import shape, state_channels
+from pipeline.policy import robot_state, shape
 from pipeline.policy.policy import Policy
 from pipeline.robot.robot_memory import RobotMemory
 
@@ -130,7 +130,7 @@ def _no_age(encoder: Any, age_s: torch.Tensor) -> torch.Tensor:
     return age_s.new_zeros(len(age_s), encoder.network[-1].out_features)
 
 
-_expand, _expanded_names = state_channels.expand, shape.expanded_names
+_expand, _expanded_names = robot_state.expand, shape.expanded_names
 
 
 def _with_motion(values: torch.Tensor, kinds: Sequence[str]) -> torch.Tensor:

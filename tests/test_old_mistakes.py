@@ -22,8 +22,7 @@ from pipeline.base.errors import RecordingError
 from pipeline.data import Recording, open_recordings
 from pipeline.datasets import UnifiedVLADataset
 from pipeline.extract import extract
-from pipeline.policy.diffusion import DiffusionActionExpert
-from pipeline.policy.noise_schedule import NoiseSchedule
+from pipeline.policy.diffusion import DiffusionActionExpert, NoiseSchedule
 from pipeline.policy.policy import Policy
 from pipeline.policy.regression import RegressionActionExpert
 from pipeline.simulation.insertion_formats import ABUTTING, write_new

@@ -16,8 +16,8 @@ from sklearn.random_projection import SparseRandomProjection
 
 from pipeline.base.arrays import widen
 from pipeline.policy.normalization import ChannelStatistics
+from pipeline.policy.robot_state import expand
 from pipeline.policy.shape import Kind, channel_kinds
-from pipeline.policy.state_channels import expand
 from pipeline.store import FeatureStore
 from pipeline.train.batches import Ticks, evenly
 from pipeline.train.predictions import Actions

@@ -1,4 +1,4 @@
-"""Ages of readings: their encoding for a network, and windows resampled to even ages."""
+"""Ages of readings: their encoding for a network, and windows resampled at even ages."""
 
 import math
 
@@ -9,7 +9,7 @@ from torch import Tensor, nn
 _PERIODS = 8
 _SHORTEST_PERIOD_S, _LONGEST_PERIOD_S = 0.5, 64.0
 _LEAST_WEIGHT = 1e-3
-"""A step with less total weight has no reading: differences of float32 ages are rounded."""
+"""A step with less total weight has no reading near it: float32 ages are rounded."""
 
 
 def fourier(seconds: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch wave"]:
@@ -21,7 +21,7 @@ def fourier(seconds: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch wave"]:
 
 
 class AgeEncoder(nn.Module):
-    """A vector (batch, width) for several ages (batch, age) in s; an unknown age is NaN."""
+    """Several ages (batch, age) in s to a vector (batch, width); an unknown age is NaN."""
 
     def __init__(self, ages: int, width: int) -> None:
         super().__init__()
@@ -30,7 +30,7 @@ class AgeEncoder(nn.Module):
         )
 
     def forward(self, age_s: Float[Tensor, "batch age"]) -> Float[Tensor, "batch width"]:
-        """Encode; an unknown age changes neither output nor gradients."""
+        """Encode; the value behind an unknown age reaches neither output nor gradients."""
         known = ~age_s.isnan()
         # Masked before it is encoded: zero times the gradient of a NaN is NaN.
         waves = fourier(age_s.masked_fill(~known, 0.0)) * known.unsqueeze(-1)
@@ -38,7 +38,7 @@ class AgeEncoder(nn.Module):
 
 
 def even_ages(readings: int, span_s: float, like: Tensor) -> Float[Tensor, " reading"]:
-    """The ages in s of readings that are spread evenly over a span, the newest 0."""
+    """The ages in s of readings spread evenly over a span; the newest has age 0."""
     steps = torch.arange(readings - 1, -1, -1, device=like.device, dtype=torch.float32)
     return steps * (span_s / readings)
 
@@ -50,14 +50,14 @@ def at_even_ages(
     steps: int,
     span_s: float,
 ) -> tuple[Float[Tensor, "batch step channel"], Bool[Tensor, "batch step"]]:
-    """The windows at `steps` even times of a span, and which steps have a valid reading near.
+    """Resample windows at `steps` even times of a span; also which steps have a valid reading near.
 
-    The last step is at the newest valid reading, whatever its age, so that readings as dense as
-    steps stay as they are. The weight of a reading falls linearly with its distance in age, to 0 at
-    the mean distance between readings or, where that is shorter, between steps: sparse readings are
-    interpolated, dense ones averaged, so that nothing aliases. Weights are normalised (normalised
-    convolution, Knutsson and Westin 1993), so that padding does not pull on its neighbours. The
-    same signal recorded at two rates gives the same windows but for what interpolation misses.
+    The last step is at the newest valid reading, whatever its age, so readings as dense as the
+    steps stay unchanged. The weight of a reading falls linearly with its distance in age. It is 0
+    at the mean distance between readings or between steps, whichever is longer: sparse readings are
+    interpolated and dense ones averaged, so nothing aliases. Weights are normalised (normalised
+    convolution, Knutsson and Westin 1993), so padding does not affect its neighbours. The same
+    signal recorded at two rates gives the same windows, up to the error of interpolation.
     """
     newest = age_s.masked_fill(~valid, torch.inf).amin(dim=1, keepdim=True)
     since = (age_s - newest).masked_fill(~valid, 0.0)

@@ -1,7 +1,8 @@
 """Pre-norm transformer layers (Xiong et al. 2020, "On Layer Normalization in the Transformer").
 
-`nn.TransformerEncoderLayer` switches to other kernels in evaluation and warns about masks; these
-run one path in training and evaluation, and under autocast norms and softmax stay in float32.
+`nn.TransformerEncoderLayer` switches to other kernels in evaluation and warns about masks. These
+layers run the same code in training and evaluation; under autocast, norms and softmax stay in
+float32.
 """
 
 import torch
@@ -41,11 +42,11 @@ class Attention(nn.Module):
         source: Tokens,
         valid: TokenMask | None = None,
     ) -> Float[Tensor, "batch query dim"]:
-        """What each query takes from the valid tokens, of which each row must have one."""
+        """The attention of each query to the valid tokens; each row must have at least one."""
         return self.attend(queries, self.project(source), valid)
 
     def project(self, source: Tokens) -> Projected:
-        """Keys and values, for a source that is attended to more than once."""
+        """Keys and values of a source, to attend to it more than once."""
         key, value = self.key_value(source).chunk(2, dim=-1)
         return self._split(key), self._split(value)
 
@@ -55,7 +56,7 @@ class Attention(nn.Module):
         projected: Projected,
         valid: TokenMask | None = None,
     ) -> Float[Tensor, "batch query dim"]:
-        """The same from keys and values of `project`."""
+        """As `forward`, with keys and values from `project`."""
         mask = None if valid is None else valid[:, None, None, :]
         query = self._split(self.query(queries))
         taken = F.scaled_dot_product_attention(query, *projected, attn_mask=mask)
@@ -93,9 +94,9 @@ class TransformerLayer(nn.Module):
     ) -> Tokens:
         """The tokens after one layer; tokens that are not valid are never attended to.
 
-        `context` may come as this layer's `project` of it, where many forward passes share it.
-        `modulation` is a shift, a scale and a gate for self-attention, then for the feed-forward
-        network (adaLN, Peebles & Xie 2023, figure 3); zeros change nothing.
+        Where many forward passes share a context, pass this layer's `project` of it. `modulation`
+        is a shift, a scale and a gate for self-attention, then for the feed-forward network (adaLN,
+        Peebles & Xie 2023, figure 3); zeros change nothing.
         """
         first, second = (None, None) if modulation is None else modulation.chunk(2, dim=1)
         normed = _shifted(self.self_norm(tokens), first)
@@ -113,7 +114,7 @@ class TransformerLayer(nn.Module):
         return tokens + _gated(self.dropout(normed), second)
 
     def project(self, context: Float[Tensor, "batch source dim"]) -> Projected:
-        """What `forward` may take in place of this context."""
+        """Keys and values that `forward` takes in place of this context."""
         assert self.cross_attention is not None
         return self.cross_attention.project(context)
 

@@ -1,19 +1,23 @@
-"""A policy on disk: `policy.safetensors`, and all that its use takes in `policy.json`.
+"""A policy on disk: `policy.safetensors`, and everything needed to use it in `policy.json`.
 
 The JSON has the feature spec of the store, the streams with their names and units, the
 normalisation, the params, and the episodes of training, val and test. `golden.safetensors` has the
-frames and features of the store's golden rows, by which a live model proves that it gives these
-features. No pickle. A kill at any instant leaves the previous checkpoint or the new one.
+frames and features of the store's golden rows, against which a live model is checked. There is no
+pickle. A kill at any instant leaves the previous checkpoint or the new one. The module imports
+torch, which takes over a second, only where weights are read.
 """
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
+from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field, field_validator, model_validator
 
+from pipeline.base.border import Document, Text, shown
 from pipeline.base.config import TrainHeadParams
 from pipeline.base.differences import describe, differences
 from pipeline.base.errors import CheckpointIncomplete, CheckpointMismatch, PipelineError
@@ -27,24 +31,122 @@ from pipeline.base.files import (
     write_tensors,
     write_with_digest,
 )
-from pipeline.base.source import EpisodePart, GoldenRow, Side, row_key
-from pipeline.policy.document import FORMAT, PolicyDocument
+from pipeline.base.source import (
+    MOST_GOLDEN,
+    SIDES,
+    EpisodePart,
+    GoldenRow,
+    Side,
+    SourceDocument,
+    row_key,
+)
 from pipeline.policy.normalization import Normalization
-from pipeline.policy.shape import PolicyShape
+from pipeline.policy.shape import MOST, PolicyShape, typical_state
 
-# torch takes over a second to import; the check for a finished training does without it.
 if TYPE_CHECKING:
     import torch
     from torch import Tensor
 
     from pipeline.policy.policy import Policy
 
+FORMAT: Literal[3] = 3
+"""3: the split has three sides; in 2 it had two, and the reported side chose the checkpoint."""
+Sha256 = Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
 WEIGHTS, DOCUMENT, GOLDEN = "policy.safetensors", "policy.json", "golden.safetensors"
 _FRAMES = "frames/"
 CHECKPOINT = OutputKind("a checkpoint of a policy", lambda folder: (folder / DOCUMENT).is_file())
 _Layout = dict[str, tuple[str, tuple[int, ...]]]
 """The dtype and the shape of each tensor."""
 SOURCE_KEYS = ("feature_spec", "streams", "action_hz", "vlm_reuse_count")
+
+
+class GoldenTexts(Document):
+    """The texts of a golden row."""
+
+    instruction: Text
+    prompt: Annotated[str, Field(max_length=1_000_000)]
+
+
+class GoldenDocument(Document):
+    """The golden rows; `golden.safetensors` has their arrays."""
+
+    sha256: Sha256
+    rows: Annotated[tuple[GoldenTexts, ...], Field(min_length=1, max_length=MOST_GOLDEN)]
+
+
+class PolicyParams(Document):
+    """The sections of params.yaml that a policy is made from."""
+
+    train_head: TrainHeadParams
+
+    @field_validator("train_head", mode="before")
+    @classmethod
+    def _without_run_params(cls, params: object) -> object:
+        """Leave out params that only the run needs; earlier versions had others of them."""
+        if not isinstance(params, dict):
+            return params
+        return {k: params[k] for k in params if k not in ("feed", "loggers", "scratch")}
+
+
+class PolicyDocument(SourceDocument):
+    """The content of `policy.json`."""
+
+    format: Literal[3]
+    step: Annotated[int, Field(ge=0)]
+    metrics: dict[Text, float]
+    params: PolicyParams
+    shape: PolicyShape
+    instructions: Annotated[tuple[Text, ...], Field(max_length=MOST)] = ()
+    split: dict[Side, dict[Text, EpisodePart]]
+    weights_sha256: Sha256
+    normalization: Normalization
+    golden: GoldenDocument | None = None
+
+    @model_validator(mode="after")
+    def _widths_fit(self) -> Self:
+        shape, streams, spec = self.shape, self.streams, self.feature_spec
+        plain = [slot for slot in spec.slots if not slot.variant]
+        expected: dict[str, tuple[object, set[object]]] = {
+            "shape.action_groups": (len(shape.action_groups), {shape.action_dim}),
+            "shape.state_kinds": (len(shape.state_kinds), {0, shape.state_dim}),
+            "shape.slots": (shape.slots, {len(plain)}),
+            "shape.feature_dim": (shape.feature_dim, {spec.dim}),
+            # 0 where the policy does not see the stream; earlier versions had no views.
+            "shape.sensor_channels": (shape.sensor_channels, {0, len(streams.sensor.names)}),
+            "shape.state_dim": (shape.state_dim, {0, len(streams.state.names)}),
+            "shape.views": (shape.views, {0, len(streams.views)}),
+            "streams.action.names": (len(streams.action.names), {shape.action_dim}),
+            "feature_spec.views": (tuple(spec.views), {tuple(streams.views)}),
+        }
+        for place, (actual, fitting) in expected.items():
+            if actual not in fitting:
+                any_of = " or ".join(sorted(map(shown, fitting)))
+                raise ValueError(f"{place}: expected {any_of}, found {shown(actual)}")
+        for anchor in shape.anchors:
+            pairs = ((anchor.action, shape.action_dim), (anchor.state, shape.state_dim))
+            if any(channel >= size for channels, size in pairs for channel in channels):
+                raise ValueError(f"shape.anchors: expected channels that are there, found {anchor}")
+        for stream, size in shape.channels.items():
+            fitted = getattr(self.normalization, stream)
+            actual = fitted and (fitted.mean.shape, fitted.std.shape)
+            if actual != (size, size) and not (fitted is None and 0 in size):
+                why = f"expected mean and std of {size}, found {actual}"
+                raise ValueError(f"normalization.{stream}: {why}")
+        return self
+
+    @model_validator(mode="after")
+    def _sides_are_apart(self) -> Self:
+        if {*self.split} != {*SIDES}:
+            raise ValueError(f"split: expected {', '.join(SIDES)}, found {', '.join(self.split)}")
+        parts = ((part, side) for side, own in self.split.items() for part in own.values())
+        ticks = sorted((part.content, part.ticks, side) for part, side in parts)
+        for (content, (_, stop), side), (other, (first, _), there) in pairwise(ticks):
+            if content == other and first < stop and side != there:
+                raise ValueError(
+                    f"split: expected each tick on one side, found some of {shown(content)} in "
+                    f"both {side} and {there}"
+                )
+        return self
 
 
 @dataclass(frozen=True)
@@ -69,7 +171,7 @@ class PolicyCheckpoint:
     """SHA-256 of the weights' file; empty before the checkpoint is saved."""
 
     def policy(self, device: "torch.device | str" = "cpu") -> "Policy":
-        """The policy with these weights, in evaluation mode; it knows its feature spec."""
+        """The policy with these weights and its feature spec, in evaluation mode."""
         from pipeline.policy.policy import Policy
 
         policy = Policy(self.params, self.shape, self.normalization)
@@ -78,11 +180,9 @@ class PolicyCheckpoint:
         return policy.to(device).eval()
 
     def typical(self, stream: str) -> NDArray[np.float64]:
-        """A stream at its training mean: a reading (channel,), or features (slot, dim)."""
-        from pipeline.policy.state_channels import typical_state
-
+        """The training mean of a stream: a reading (channel,), or features (slot, dim)."""
         statistics = getattr(self.normalization, stream)
-        assert statistics is not None, "a policy has statistics of each stream that it sees"
+        assert statistics is not None, "a policy has statistics of every stream that it sees"
         if stream != "state":
             return statistics.mean
         return np.array(typical_state(statistics.mean.tolist(), self.shape.kinds))
@@ -114,7 +214,7 @@ def save_policy(
 ) -> None:
     """Put a checkpoint at `folder`, in place of an older one there, atomically.
 
-    `beside` writes into the same folder what stands beside the policy. Raises `DiskFull`.
+    `beside` writes further files into the same folder. Raises `DiskFull`.
     """
 
     def write(temporary: Path) -> None:
@@ -128,9 +228,9 @@ def save_policy(
 
 
 def find_policy(path: Path) -> Path:
-    """The checkpoint folder that `path` means: itself, or the best of a training's output.
+    """The checkpoint folder at `path`: itself, or the best checkpoint of a training's output.
 
-    Raises `CheckpointIncomplete` where neither is one.
+    Raises `CheckpointIncomplete` where there is neither.
     """
     for folder in (path, path / "best"):
         if (folder / DOCUMENT).exists():
@@ -152,9 +252,8 @@ def load_policy(folder: Path) -> PolicyCheckpoint:
     import torch
 
     document, content = read_document(folder / DOCUMENT, PolicyDocument)
-    path = folder / WEIGHTS
-    described = _described_weights(folder, document)
-    # Of training alone, and absent from policies that were trained before it was there.
+    path, described = folder / WEIGHTS, _described_weights(folder, document)
+    # The layer `direct` is used in training alone; older checkpoints lack it.
     weights = dict(read_tensors(path, document.weights_sha256))
     absent = {name for name in described.keys() - weights.keys() if ".direct." in name}
     kept = {name: layout for name, layout in described.items() if name not in absent}
@@ -176,7 +275,7 @@ def load_policy(folder: Path) -> PolicyCheckpoint:
 
 
 def check_policy(folder: Path) -> None:
-    """Raise `CheckpointIncomplete` as `load_policy`; no weight is opened."""
+    """Raise `CheckpointIncomplete` as `load_policy` does; opens no weights."""
     document, _ = read_document(folder / DOCUMENT, PolicyDocument)
     check_digest(folder / WEIGHTS, document.weights_sha256)
     if document.golden is not None:
@@ -184,9 +283,9 @@ def check_policy(folder: Path) -> None:
 
 
 def _described_weights(folder: Path, document: PolicyDocument) -> _Layout:
-    """The weights of the described policy, which is built without memory: it may be huge.
+    """The layout of the described policy, which is built without memory: it may be huge.
 
-    Raises `CheckpointIncomplete` where no such policy can be.
+    Raises `CheckpointIncomplete` where no such policy can be built.
     """
     import torch
 
@@ -237,26 +336,25 @@ def _golden_tensors(rows: Sequence[GoldenRow]) -> "dict[str, Tensor]":
 
 
 def _read_golden(folder: Path, document: PolicyDocument) -> tuple[GoldenRow, ...]:
-    """The golden rows; their keys are those under the feature spec of the document."""
+    """The golden rows, with their keys under the document's feature spec."""
     if document.golden is None:
         return ()
     path, spec, shape = folder / GOLDEN, document.feature_spec, document.shape
     tensors = read_tensors(path, document.golden.sha256)
     expected: _Layout = {}
     frames_of: list[dict[str, Tensor]] = []
-    for number, _ in enumerate(document.golden.rows):
+    for number in range(len(document.golden.rows)):
         expected[f"{number}/features"] = "torch.float32", (shape.slots, shape.feature_dim)
         expected[f"{number}/slot_valid"] = "torch.bool", (shape.slots,)
         places = {view: f"{number}/{_FRAMES}{view}" for view in spec.views}
         there = {view: tensors[at] for view, at in places.items() if at in tensors}
-        frames = {view: frame for view, frame in there.items() if frame.numel()}
-        for view, frame in frames.items():
+        frames_of.append({view: frame for view, frame in there.items() if frame.numel()})
+        for view, frame in frames_of[-1].items():
             expected[places[view]] = "torch.uint8", (*frame.shape[:2], 3)
-        frames_of.append(frames)
     _check_tensors(path, tensors, expected)
     rows: list[GoldenRow] = []
-    for number, (row, shown) in enumerate(zip(document.golden.rows, frames_of, strict=True)):
-        frames = {view: frame.numpy() for view, frame in shown.items()}
+    for number, (row, own) in enumerate(zip(document.golden.rows, frames_of, strict=True)):
+        frames = {view: frame.numpy() for view, frame in own.items()}
         features, valid = (tensors[f"{number}/{n}"].numpy() for n in ("features", "slot_valid"))
         key = row_key(spec.digest, spec.views, row.prompt, frames)
         rows.append(GoldenRow(key, row.instruction, row.prompt, frames, features, valid))

@@ -1,36 +1,40 @@
-"""The action expert that removes noise step by step (Ho et al. 2020; Song et al. 2021)."""
+"""The action expert that removes noise step by step (Ho et al. 2020; Song et al. 2021).
 
+Steps count as in the papers: 0 is clean and `timesteps` is almost pure noise. At step t a sample
+x0 and a standard normal epsilon make `x_t = signal[t] x0 + noise[t] epsilon`.
+"""
+
+import math
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from typing import Literal
 
 import torch
-from torch import Generator
+from jaxtyping import Float, Int
+from torch import Generator, Tensor, nn
 
-from pipeline.policy.attention import Projected
-from pipeline.policy.denoiser import Denoiser
+from pipeline.policy.denoiser import DrawingExpert, Source, gain, pull
 from pipeline.policy.expert import (
     Chunk,
     Context,
-    DrawingExpert,
     Generators,
     Guide,
     Losses,
     StepMask,
-    gain,
-    pull,
     standard_normal,
     uniform,
 )
-from pipeline.policy.noise_schedule import NoiseSchedule, Prediction, ScheduleKind
+
+ScheduleKind = Literal["cosine", "linear"]
+Prediction = Literal["epsilon", "sample", "v"]
 
 
 class DiffusionActionExpert(DrawingExpert):
     """A denoising diffusion model of the chunk given the context.
 
     `sampler` ddpm visits every step of the schedule; ddim visits `sampling_steps` of them, with
-    `eta` from 0 (nothing random but the first noise) to 1 (as random as ddpm). In each the
-    predicted clean chunk is held within +-`clip`, and the step is taken from the chunk so held.
+    `eta` from 0 (random is only the first noise) to 1 (as random as ddpm). Each step clips the
+    predicted clean chunk to +-`clip` and continues from the clipped chunk.
     """
 
     def __init__(
@@ -53,23 +57,21 @@ class DiffusionActionExpert(DrawingExpert):
         groups: Sequence[str] | None = None,
         group_weights: Mapping[str, float] | None = None,
     ) -> None:
-        super().__init__(horizon, action_dim, dim, draws, groups, group_weights)
+        super().__init__(
+            horizon, action_dim, dim, layers, heads, dropout, draws, groups, group_weights
+        )
         self.prediction: Prediction = prediction
         self.sampler, self.eta, self.clip = sampler, eta, clip
         self.schedule = NoiseSchedule(timesteps, schedule)
         self.steps = self.schedule.steps(timesteps if sampler == "ddpm" else sampling_steps)
-        self.denoiser = Denoiser(
-            horizon=horizon, action_dim=action_dim, dim=dim, layers=layers, heads=heads,
-            dropout=dropout,
-        )  # fmt: skip
 
     def drawn_loss(
         self, context: Context, chunk: Chunk, valid: StepMask, generator: Generator | None
     ) -> Losses:
         """The grouped squared error of the prediction at drawn steps.
 
-        A step of the schedule is drawn in proportion to its number: noisy ones, which tell the way
-        from the context, more often than those that are nearly clean.
+        A step of the schedule is drawn in proportion to its number: noisy steps, where the network
+        learns from the context, more often than nearly clean ones.
         """
         epsilon = standard_normal(chunk.shape, chunk.device, generator)
         drawn = uniform(len(chunk), chunk.device, generator).sqrt()
@@ -79,42 +81,34 @@ class DiffusionActionExpert(DrawingExpert):
         target = self.schedule.target(self.prediction, chunk, epsilon, step)
         return self.grouped(predicted, target, valid)
 
-    @torch.no_grad()
-    def act(
-        self, context: Context, generator: Generators = None, guide: Guide | None = None
+    def denoise(
+        self, noise: Chunk, context: Source, generator: Generators, guide: Guide | None
     ) -> Chunk:
-        """A chunk drawn by the sampler, float32; from noise, the context and the generator.
-
-        With a guide every step is taken from the clean chunk that it asks for.
-        """
-        shape = (context.shape[0], self.horizon, self.action_dim)
-        chunk = standard_normal(shape, context.device, generator)
-        prepared = self.denoiser.prepare(context)
+        """The sampler's chunk; a guide corrects the clean chunk that each step is taken from."""
+        chunk = noise
         for step, to in pairwise(self.steps):
             if guide is None:
-                sample = self.clean(chunk, step, prepared)
+                sample = self.clean(chunk, step, context)
             else:
-                sample = self.guided(chunk, step, prepared, guide)
+                sample = self.guided(chunk, step, context, guide)
             if self.sampler == "ddpm":
                 chunk, variance = self.schedule.posterior(sample, chunk, step)
             else:
                 chunk, variance = self.schedule.ddim(sample, chunk, step, to, self.eta)
             if self.sampler == "ddpm" or self.eta:
-                noise = standard_normal(shape, context.device, generator)
-                chunk = chunk + variance.sqrt() * noise
+                drawn = standard_normal(chunk.shape, chunk.device, generator)
+                chunk = chunk + variance.sqrt() * drawn
         return chunk
 
-    def clean(self, noisy: Chunk, step: int, context: Context | Sequence[Projected]) -> Chunk:
-        """The clean chunk that the network sees in a noisy one at this step, clipped."""
+    def clean(self, noisy: Chunk, step: int, context: Source) -> Chunk:
+        """The clean chunk that the network predicts from a noisy one at this step, clipped."""
         return self._clipped(self._estimate(noisy, step, context))
 
-    def guided(
-        self, noisy: Chunk, step: int, context: Context | Sequence[Projected], guide: Guide
-    ) -> Chunk:
+    def guided(self, noisy: Chunk, step: int, context: Source, guide: Guide) -> Chunk:
         """The clean chunk at this step corrected by a guide, clipped.
 
-        As flow matching would at the time where as much of the chunk is left: signal / noise. The
-        clip has a slope of 1 here, so that what it holds can still be pulled.
+        The correction is that of flow matching at the time with the same ratio signal / noise. The
+        clip has a slope of 1 here, so that the guide also pulls what the clip holds.
         """
         with torch.enable_grad():
             noisy = noisy.detach().requires_grad_()
@@ -124,10 +118,123 @@ class DiffusionActionExpert(DrawingExpert):
         change = noise * gain(signal, noise) * pull(sample, noisy, guide)
         return self._clipped(sample.detach() + change)
 
-    def _estimate(self, noisy: Chunk, step: int, context: Context | Sequence[Projected]) -> Chunk:
+    def _estimate(self, noisy: Chunk, step: int, context: Source) -> Chunk:
         time = noisy.new_full(noisy.shape[:1], step / self.schedule.timesteps)
         predicted = self.denoiser(noisy, time, context)
         return self.schedule.sample_of(self.prediction, predicted, noisy, step)
 
     def _clipped(self, sample: Chunk) -> Chunk:
         return sample if self.clip is None else sample.clamp(-self.clip, self.clip)
+
+
+class NoiseSchedule(nn.Module):
+    """The noise schedule: how much of a sample and how much noise is left at every step.
+
+    `alpha_bar`, its roots `signal` = sqrt(alpha_bar) and `noise` = sqrt(1 - alpha_bar), each
+    (timesteps + 1,), are buffers: they move with the module, and weights come back with the
+    schedule that they were trained on.
+    """
+
+    alpha_bar: Tensor
+    signal: Tensor
+    noise: Tensor
+
+    def __init__(self, timesteps: int = 100, kind: ScheduleKind = "cosine") -> None:
+        super().__init__()
+        self.timesteps = timesteps
+        betas = _cosine_betas(timesteps) if kind == "cosine" else _linear_betas(timesteps)
+        clean = torch.ones(1, dtype=torch.float64, device="cpu")
+        alpha_bar = torch.cat([clean, (1 - betas).cumprod(0)])
+        # Rounded at the end: of 1 - alpha_bar, float32 has few digits left at small steps.
+        self.register_buffer("alpha_bar", alpha_bar.float())
+        self.register_buffer("signal", alpha_bar.sqrt().float())
+        self.register_buffer("noise", (1 - alpha_bar).sqrt().float())
+
+    def steps(self, count: int) -> list[int]:
+        """`count` falling steps and then 0, evenly spaced: what a sampler visits.
+
+        A sampler begins with pure noise, so it must begin near the top, or its mean is pulled
+        towards the noise's; but at the very top nothing is left of the sample, so a predicted
+        epsilon says nothing about it: where there is a choice, the first step is at 98 %. The last
+        is at half an interval of the schedule, so that the final jump keeps the spread.
+        """
+        first = max(count, round(0.98 * self.timesteps))
+        last = max(1, round(self.timesteps / count / 2)) if count > 1 else first
+        shares = [index / max(1, count - 1) for index in range(count)]
+        return [round(first + (last - first) * share) for share in shares] + [0]
+
+    def add_noise(self, sample: Chunk, epsilon: Chunk, step: Int[Tensor, " batch"]) -> Chunk:
+        """The noisy chunk at each row's step (Ho et al. 2020, eq. 4)."""
+        return self._at(self.signal, step) * sample + self._at(self.noise, step) * epsilon
+
+    def target(
+        self, kind: Prediction, sample: Chunk, epsilon: Chunk, step: Int[Tensor, " batch"]
+    ) -> Chunk:
+        """What a network of this kind learns to predict (v: Salimans & Ho 2022, section 4)."""
+        if kind == "epsilon":
+            return epsilon
+        if kind == "sample":
+            return sample
+        return self._at(self.signal, step) * epsilon - self._at(self.noise, step) * sample
+
+    def sample_of(
+        self, kind: Prediction, predicted: Chunk, noisy: Chunk, step: Int[Tensor, " batch"] | int
+    ) -> Chunk:
+        """The clean chunk that a prediction stands for; steps are above 0."""
+        signal, noise = self._at(self.signal, step), self._at(self.noise, step)
+        if kind == "epsilon":
+            return (noisy - noise * predicted) / signal
+        if kind == "sample":
+            return predicted
+        return signal * noisy - noise * predicted
+
+    def epsilon_of(self, sample: Chunk, noisy: Chunk, step: Int[Tensor, " batch"] | int) -> Chunk:
+        """The noise between a clean chunk and a noisy one; steps are above 0."""
+        return (noisy - self._at(self.signal, step) * sample) / self._at(self.noise, step)
+
+    def posterior(self, sample: Chunk, noisy: Chunk, step: int) -> tuple[Chunk, Float[Tensor, ""]]:
+        """Mean and variance of step - 1 given this step and the clean chunk (Ho 2020, eq. 7).
+
+        The caller clips `sample`; the mean depends on the arguments alone.
+        """
+        before, now = self.alpha_bar[step - 1], self.alpha_bar[step]
+        beta = 1 - now / before
+        cleaned = self.noise[step - 1] ** 2 / self.noise[step] ** 2
+        mean = before.sqrt() * beta / self.noise[step] ** 2 * sample
+        return mean + (1 - beta).sqrt() * cleaned * noisy, cleaned * beta
+
+    def ddim(
+        self, sample: Chunk, noisy: Chunk, step: int, to: int, eta: float
+    ) -> tuple[Chunk, Float[Tensor, ""]]:
+        """Mean and variance of step `to` < `step` (Song et al. 2021, eq. 12 and 16).
+
+        The noise of eq. 12 is that between `sample` and `noisy`, also where the caller clipped
+        `sample`, so that `eta` = 1 from each step to the next equals `posterior`.
+        """
+        ratio = self.alpha_bar[step] / self.alpha_bar[to]
+        cleaned = self.noise[to] ** 2 / self.noise[step] ** 2
+        variance = eta**2 * cleaned * (1 - ratio)
+        epsilon = self.epsilon_of(sample, noisy, step)
+        left = (self.noise[to] ** 2 - variance).clamp(min=0).sqrt()
+        return self.signal[to] * sample + left * epsilon, variance
+
+    def _at(self, values: Tensor, step: Tensor | int) -> Tensor:
+        return values[step].view(-1, 1, 1)
+
+
+def _cosine_betas(timesteps: int) -> Tensor:
+    """Nichol & Dhariwal 2021, eq. 17, betas held at 0.999 as there."""
+    share = torch.linspace(0, 1, timesteps + 1, dtype=torch.float64, device="cpu")
+    alpha_bar = torch.cos((share + 0.008) / 1.008 * math.pi / 2) ** 2
+    return (1 - alpha_bar[1:] / alpha_bar[:-1]).clamp(max=0.999)
+
+
+def _linear_betas(timesteps: int) -> Tensor:
+    """Ho et al. 2020, section 4: 1e-4 to 0.02 over 1000 steps.
+
+    With another number of steps they grow by 1000 / timesteps, so that as little is left at the
+    end, and are held at 0.999.
+    """
+    scale = 1000 / timesteps
+    betas = torch.linspace(1e-4, 0.02, timesteps, dtype=torch.float64, device="cpu")
+    return (scale * betas).clamp(max=0.999)

@@ -1,7 +1,7 @@
-"""Encoders of the streams: features to a token a slot, windows of readings to one vector each.
+"""Encoders of the streams: a token for each slot of features, a vector for a window of readings.
 
-The high-rate sensor goes through residual stride-2 convolutions, the state through strided patches;
-then each through a transformer.
+The high-rate sensor passes residual stride-2 convolutions and the state strided patches; then each
+passes a transformer.
 """
 
 from collections.abc import Sequence
@@ -12,21 +12,23 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from pipeline.base.config import TrainHeadParams
 from pipeline.base.errors import ConfigError
 from pipeline.policy.ages import AgeEncoder, at_even_ages, even_ages
 from pipeline.policy.attention import TransformerLayer, learned, masked_mean, right_aligned
+from pipeline.policy.shape import PolicyShape
 
 _FORCE_SHARE = 4
-"""One part in so many of an encoded window is force's, in `ForceAwareSensorEncoder`."""
+"""`ForceAwareSensorEncoder` gives force one part in so many of an encoded window."""
 
 
 class FeatureEncoder(nn.Module):
-    """Tokens (batch, slot, width) for normalised features (batch, slot, dim) and their age.
+    """Normalised features (batch, slot, dim) and their ages to tokens (batch, slot, width).
 
-    All slots share one projection to `width`, which keeps the cost at dim·width a slot; an
-    embedding of its own tells a grid cell from the next. The ages in s, since the newest frame and
-    since that of each view, are added to every token and tell how stale the vision is. A slot that
-    is not valid is a learned embedding of its own, which has no age.
+    All slots share one projection to `width`, so the cost is dim·width a slot; each slot has a
+    learned embedding, so grid cells are told apart. The ages in s, of the newest frame and of that
+    of each view, are encoded and added to every token. A slot that is not valid becomes another
+    learned embedding, without an age.
     """
 
     def __init__(
@@ -49,9 +51,9 @@ class FeatureEncoder(nn.Module):
         age_s: Float[Tensor, " batch"],
         view_age_s: Float[Tensor, "batch view"] | None = None,
     ) -> Float[Tensor, "batch slot width"]:
-        """Encode; what stands in a slot that is not valid never reaches output or gradients.
+        """Encode; the content of a slot that is not valid reaches neither output nor gradients.
 
-        Nor do the ages of a sample without any valid slot. That of a missing view is NaN.
+        Nor do the ages of a sample without a valid slot. The age of a missing view is NaN.
         """
         absent = ~slot_valid.unsqueeze(-1)
         slots = self.squeeze(features.masked_fill(absent, 0.0)) + self.slot
@@ -93,12 +95,12 @@ class HalvingBlock(nn.Module):
 
 
 class WindowEncoder(nn.Module):
-    """What the encoders of a window share: readings placed by age, a transformer, a mean.
+    """The part that the encoders of windows share: readings placed by age, a transformer, a mean.
 
     Windows are right-aligned: the last `valid[i]` readings of row i are real, the rest is padding
-    that never reaches the output. Where `valid[i]` is 0 the output is a learned embedding. Readings
-    come by their ages (batch, window) in s onto `window` steps of equal age that span `span_s`;
-    without a span or ages they are taken as evenly spread over it. The newest age is an input.
+    that never reaches the output. Where `valid[i]` is 0, the output is a learned embedding.
+    Readings are placed by their ages (batch, window) in s on `window` steps of equal age that span
+    `span_s`; without a span or ages they count as evenly spread. The newest age is an input.
     """
 
     window: int
@@ -107,7 +109,7 @@ class WindowEncoder(nn.Module):
     def tokenize(
         self, values: Float[Tensor, "batch step channel"], mask: Bool[Tensor, "batch step"]
     ) -> tuple[Float[Tensor, "batch token dim"], Bool[Tensor, "batch token"]]:
-        """The window's tokens, and which of them stand on a reading, as its steps in `mask` do."""
+        """The window's tokens, and which of them have a reading; `mask` says it of the steps."""
         raise NotImplementedError
 
     def place(
@@ -116,7 +118,7 @@ class WindowEncoder(nn.Module):
         valid: Int[Tensor, " batch"],
         age_s: Float[Tensor, "batch reading"] | None,
     ) -> tuple[Float[Tensor, "batch step channel"], Bool[Tensor, "batch step"]]:
-        """The readings at the encoder's steps, and which of these stand on a reading."""
+        """The readings resampled at the encoder's steps, and which steps have a reading."""
         mask, span_s = right_aligned(valid, values.shape[1]), self.span_s or 1.0
         if age_s is None or self.span_s is None:
             if values.shape[1] == self.window:
@@ -127,7 +129,7 @@ class WindowEncoder(nn.Module):
     def build_layers(
         self, tokens: int, dim: int, layers: int, heads: int, expansion: int, output_dim: int
     ) -> None:
-        """Draw the weights behind the tokens, after those that make them."""
+        """Draw the weights that follow the tokens; call it after the weights of the tokens."""
         self.position = learned(tokens, dim)
         self.layers = nn.ModuleList(TransformerLayer(dim, heads, expansion) for _ in range(layers))
         self.norm = nn.LayerNorm(dim)
@@ -158,7 +160,7 @@ class WindowEncoder(nn.Module):
 
 
 class SensorEncoder(WindowEncoder):
-    """One vector for a window of normalised readings, whatever its channels are.
+    """One vector for a window of normalised readings of any channels.
 
     Shapes (batch, window, channel) -> (batch, output_dim).
     """
@@ -185,10 +187,10 @@ class SensorEncoder(WindowEncoder):
     def tokenize(
         self, values: Float[Tensor, "batch step channel"], mask: Bool[Tensor, "batch step"]
     ) -> tuple[Float[Tensor, "batch token dim"], Bool[Tensor, "batch token"]]:
-        """What the last block gives, of a copy of the window that is zero where no reading stands.
+        """The output of the last block, for a copy of the window with zeros where no reading is.
 
-        One copy for that and for a step in front of an odd number of them: the windows are the
-        largest tensors of a training step.
+        The same copy gets a step in front of an odd number of steps: the windows are the largest
+        tensors of a training step, so they are copied once.
         """
         odd = values.shape[1] % 2
         front = values.new_zeros(values.shape[0], odd, values.shape[2])
@@ -202,9 +204,9 @@ class SensorEncoder(WindowEncoder):
 class ForceAwareSensorEncoder(nn.Module):
     """One vector for a window of normalised readings, a quarter of it from force alone.
 
-    Shapes, masking and defaults are those of `SensorEncoder`. Channel 0 has a branch of its own, a
-    quarter as wide (rounded up to whole heads) as that of the other channels, so that one channel
-    among a thousand of an A-scan is not drowned; the two encoded windows stand side by side.
+    Shapes, masking and defaults are those of `SensorEncoder`. Force, channel 0, has a branch of its
+    own, a quarter as wide (rounded up to whole heads) as the branch of the other channels, so that
+    the thousand channels of an A-scan do not drown it. The output joins both encoded windows.
     Raises `ConfigError` where there is no other channel, or no room for two branches.
     """
 
@@ -247,8 +249,8 @@ class RobotStateEncoder(WindowEncoder):
     """One vector for a window of normalised robot states (6 joints and a pose: 12 wide).
 
     Shapes (batch, window, dim) -> (batch, output_dim). `patch` readings make one token (10 at
-    100 Hz are one 10 Hz tick), which costs a tenth of a token a reading; each patch is told which
-    of its readings are real.
+    100 Hz are one 10 Hz tick), a tenth of the cost of a token for each reading. The input of a
+    patch also says which of its readings are real.
     """
 
     def __init__(
@@ -277,3 +279,49 @@ class RobotStateEncoder(WindowEncoder):
         values = torch.cat([values, mask.to(values.dtype)], dim=-1)
         present = mask.squeeze(-1).unflatten(1, (-1, self.patch)).any(dim=-1)
         return self.embed(values.unflatten(1, (-1, self.patch)).flatten(2)), present
+
+
+SENSOR_ENCODERS: dict[str, type[SensorEncoder] | type[ForceAwareSensorEncoder]] = {
+    "joint": SensorEncoder,
+    "force_aware": ForceAwareSensorEncoder,
+}
+"""The class of each `train_head.sensor_encoder.kind`."""
+
+
+def build_encoders(
+    params: TrainHeadParams, shape: PolicyShape
+) -> tuple[nn.ModuleDict, dict[str, tuple[int, int]]]:
+    """Encoders of the streams both present and enabled, and how many tokens of what width each.
+
+    Raises `ConfigError` where no stream is left.
+    """
+    encoders, tokens = nn.ModuleDict(), dict[str, tuple[int, int]]()
+    if params.features_enabled and shape.slots and shape.feature_dim:
+        features = FeatureEncoder(shape.slots, shape.feature_dim, views=shape.views)
+        encoders["features"], tokens["features"] = features, (shape.slots, features.width)
+    if params.sensor_enabled and shape.sensor_channels:
+        sensor = params.sensor_encoder
+        encoders["sensor"] = SENSOR_ENCODERS[sensor.kind](
+            shape.sensor_channels,
+            params.sensor_window,
+            span_s=params.sensor_window_s,
+            **sensor.model_dump(exclude={"kind"}),
+        )
+        tokens["sensor"] = (1, sensor.output_dim)
+    if params.robot_state_enabled and shape.state_dim:
+        state = params.state_encoder
+        encoders["state"] = RobotStateEncoder(
+            shape.channels["state"][0],
+            params.state_window,
+            span_s=params.state_window_s,
+            **state.model_dump(),
+        )
+        tokens["state"] = (1, state.output_dim)
+    if not tokens:
+        raise ConfigError(
+            "the policy has nothing to look at: the store has "
+            f"{shape.slots} feature slots, {shape.sensor_channels} sensor channels and "
+            f"{shape.state_dim} state channels. Enable one of these in train_head "
+            "(features_enabled, sensor_enabled, robot_state_enabled)."
+        )
+    return encoders, tokens

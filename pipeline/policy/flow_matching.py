@@ -7,17 +7,14 @@ import torch
 from jaxtyping import Float
 from torch import Generator, Tensor, nn
 
-from pipeline.policy.denoiser import Denoiser
+from pipeline.policy.denoiser import DrawingExpert, Source, gain, pull
 from pipeline.policy.expert import (
     Chunk,
     Context,
-    DrawingExpert,
     Generators,
     Guide,
     Losses,
     StepMask,
-    gain,
-    pull,
     standard_normal,
     uniform,
 )
@@ -26,7 +23,7 @@ Solver = Literal["euler", "midpoint", "rk4"]
 Velocity = Callable[[Tensor, float], Tensor]
 
 _STAGES: dict[Solver, tuple[tuple[float, ...], tuple[float, ...]]] = {
-    # Where in the step each stage stands, and its weight; each stage builds on the one before.
+    # The place of each stage within the step, and its weight; each stage builds on the one before.
     "euler": ((0.0,), (1.0,)),
     "midpoint": ((0.0, 0.5), (0.0, 1.0)),
     "rk4": ((0.0, 0.5, 0.5, 1.0), (1 / 6, 1 / 3, 1 / 3, 1 / 6)),
@@ -52,14 +49,14 @@ def integrate(velocity: Velocity, start: Tensor, steps: int, solver: Solver) -> 
 class BetaTimes(nn.Module):
     """Times t in [0, 1] whose noise share 1 - t is beta-distributed.
 
-    From uniform numbers through a table of the distribution's quantiles (its distribution function
-    is met within 1/4096): `torch.distributions.Beta` takes no generator.
+    Uniform numbers go through a table of the distribution's quantiles, exact to 1/4096 in
+    probability: `torch.distributions.Beta` takes no generator.
     """
 
     quantiles: Tensor
 
     def __init__(self, alpha: float, beta: float) -> None:
-        from scipy.special import betaincinv  # slow to import, and of this one class
+        from scipy.special import betaincinv  # slow to import; only used here
 
         super().__init__()
         grid = torch.linspace(0, 1, 4097, dtype=torch.float64, device="cpu")
@@ -67,7 +64,7 @@ class BetaTimes(nn.Module):
         self.register_buffer("quantiles", table.float(), persistent=False)
 
     def forward(self, drawn: Float[Tensor, " batch"]) -> Float[Tensor, " batch"]:
-        """The times that uniform numbers in [0, 1) stand for."""
+        """The times for uniform numbers in [0, 1)."""
         place = drawn * (len(self.quantiles) - 1)
         below = place.long()
         return 1 - torch.lerp(self.quantiles[below], self.quantiles[below + 1], place - below)
@@ -79,7 +76,7 @@ class FlowMatchingActionExpert(DrawingExpert):
     Noise at t = 0 and the chunk at t = 1 are joined by x_t = (1 - t) noise + t chunk (Lipman et
     al. 2023, eq. 22 with no noise left at the end); the network learns the velocity chunk - noise,
     and `act` follows it in `sampling_steps` steps of `solver`. `time` says how t is drawn in the
-    loss: uniform, or with a noise share 1 - t of Beta(`alpha`, `beta`) (pi0, Black et al. 2024).
+    loss: uniformly, or with a noise share 1 - t of Beta(`alpha`, `beta`) (pi0, Black et al. 2024).
     """
 
     def __init__(
@@ -100,14 +97,12 @@ class FlowMatchingActionExpert(DrawingExpert):
         groups: Sequence[str] | None = None,
         group_weights: Mapping[str, float] | None = None,
     ) -> None:
-        super().__init__(horizon, action_dim, dim, draws, groups, group_weights)
+        super().__init__(
+            horizon, action_dim, dim, layers, heads, dropout, draws, groups, group_weights
+        )
         self.sampling_steps = sampling_steps
         self.solver: Solver = solver
         self.times = BetaTimes(alpha, beta) if time == "beta" else nn.Identity()
-        self.denoiser = Denoiser(
-            horizon=horizon, action_dim=action_dim, dim=dim, layers=layers, heads=heads,
-            dropout=dropout,
-        )  # fmt: skip
 
     def drawn_loss(
         self, context: Context, chunk: Chunk, valid: StepMask, generator: Generator | None
@@ -119,17 +114,13 @@ class FlowMatchingActionExpert(DrawingExpert):
         noisy = (1 - share) * noise + share * chunk
         return self.grouped(self.denoiser(noisy, time, context, valid), chunk - noise, valid)
 
-    @torch.no_grad()
-    def act(
-        self, context: Context, generator: Generators = None, guide: Guide | None = None
+    def denoise(
+        self, noise: Chunk, context: Source, generator: Generators, guide: Guide | None
     ) -> Chunk:
-        """Where the flow takes a drawn noise, float32; with a guide, the flow so corrected."""
-        shape = (context.shape[0], self.horizon, self.action_dim)
-        noise = standard_normal(shape, context.device, generator)
-        prepared = self.denoiser.prepare(context)
+        """Where the flow takes the noise; a guide corrects the velocity."""
 
         def velocity(x: Tensor, time: float) -> Tensor:
-            return self.denoiser(x, x.new_full(x.shape[:1], time), prepared)
+            return self.denoiser(x, x.new_full(x.shape[:1], time), context)
 
         def guided(x: Tensor, time: float) -> Tensor:
             assert guide is not None

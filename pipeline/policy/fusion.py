@@ -1,4 +1,4 @@
-"""How the encoders' tokens become the context that an action expert attends to."""
+"""Fusions: the encoders' tokens become the context that an action expert attends to."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
@@ -15,7 +15,7 @@ Shapes = Mapping[str, tuple[int, int]]
 """Tokens and width of each encoder, by its name."""
 
 _TOKENS = 4
-"""Tokens of a context that is read out of one vector, or asked for by learned queries."""
+"""Context tokens that `read_out` makes of one vector, and learned queries."""
 _LAYERS = 2
 """Layers of `CrossAttentionFusion`."""
 _MARK_STD = 3**-0.5
@@ -23,11 +23,11 @@ _MARK_STD = 3**-0.5
 
 
 class Fusion(nn.Module, ABC):
-    """The contract: tokens (batch, token, width) an encoder in, context (batch, token, dim) out.
+    """The contract: tokens (batch, token, width) by encoder in, context (batch, token, dim) out.
 
     Encoders are named `features`, `sensor` and `state`; every encoder in `shapes` always gives its
-    tokens, learned embeddings for what is missing or masked. No stream drowns another by its scale.
-    The constructor fixes the number of context tokens.
+    tokens, with learned embeddings for what is missing or masked. The scale of a stream does not
+    let it drown another. The constructor fixes the number of context tokens.
     """
 
     @abstractmethod
@@ -36,10 +36,10 @@ class Fusion(nn.Module, ABC):
 
 
 class StreamVectors(nn.Module):
-    """One normalised vector a stream: its tokens side by side, so that each keeps its place.
+    """One normalised vector for each stream: its tokens concatenated, so each keeps its place.
 
-    Several tokens are projected to `dim`; a single one is taken as it is. `widths` says how wide
-    each vector is.
+    Several tokens are projected to `dim`; a single token stays as it is. `widths` has the width of
+    each vector.
     """
 
     def __init__(self, shapes: Shapes, dim: int) -> None:
@@ -68,10 +68,10 @@ class StreamVectors(nn.Module):
 
 
 class StreamTokens(nn.Module):
-    """The tokens of each stream, normalised, projected to `dim` and marked as its own.
+    """The tokens of each stream, normalised, projected to `dim` and marked.
 
-    A mark is learned for each token, so that attention tells streams and places apart. It is drawn
-    as large as what it is added to: at the usual 0.02 a grid cell would have to learn its place.
+    A mark is learned for each token, so that attention tells streams and places apart. Its initial
+    std is that of the token: at the usual 0.02 a grid cell would have to learn its place.
     """
 
     def __init__(self, shapes: Shapes, dim: int) -> None:
@@ -96,14 +96,14 @@ class StreamTokens(nn.Module):
 
 
 def read_out(dim: int) -> nn.Sequential:
-    """Several context tokens from one vector: attention to a single one is a constant."""
+    """Several context tokens from one vector: attention to a single token is a constant."""
     return nn.Sequential(
         nn.Linear(dim, _TOKENS * dim), nn.Unflatten(-1, (_TOKENS, dim)), nn.LayerNorm(dim)
     )
 
 
 class ConcatFusion(Fusion):
-    """The streams' vectors side by side through a small network, read out as four tokens."""
+    """The streams' vectors, concatenated, through a small network, read out as four tokens."""
 
     def __init__(self, shapes: Shapes, dim: int) -> None:
         super().__init__()
@@ -123,8 +123,8 @@ class GatedFusion(Fusion):
 
     h = sum_i z_i * tanh(W_i x_i) with gates z_i = sigmoid(V_i [x_1, ..., x_n]) in (0, 1), one for
     each stream and each of the `dim` channels (Arevalo et al. 2017, "Gated Multimodal Units",
-    section 3.1). What a gate lets through depends on all streams: vision that is stale or missing
-    can be shut out in favour of the sensor, sample by sample.
+    section 3.1). A gate depends on all streams: it can shut out stale or missing vision in favour
+    of the sensor, sample by sample.
     """
 
     def __init__(self, shapes: Shapes, dim: int) -> None:
@@ -140,7 +140,7 @@ class GatedFusion(Fusion):
     def gates(
         self, vectors: Mapping[str, Float[Tensor, "batch _"]]
     ) -> dict[str, Float[Tensor, "batch dim"]]:
-        """How much of each stream is let through, in (0, 1), by channel."""
+        """The gate of each stream, in (0, 1), by channel."""
         opened = self.gate(torch.cat([*vectors.values()], dim=-1)).float().sigmoid()
         return dict(zip(vectors, opened.chunk(len(vectors), dim=-1), strict=True))
 
@@ -153,11 +153,11 @@ class GatedFusion(Fusion):
 
 
 class CrossAttentionFusion(Fusion):
-    """Sensor, state and learned queries look at the feature slots: what is felt asks what is seen.
+    """Tokens of sensor and state, and learned queries, attend to the feature slots.
 
-    Each of two layers lets these tokens attend to one another and then to the slots; the
-    context is the tokens, four queries and one for each token of sensor and state. Without features
-    they attend to one another alone; without sensor and state the queries ask.
+    In each of two layers these tokens attend to one another and then to the slots. The context is
+    these tokens: four queries and each token of sensor and state. Without features they attend to
+    one another alone; without sensor and state there are only the queries.
     """
 
     def __init__(self, shapes: Shapes, dim: int, heads: int) -> None:
@@ -181,7 +181,7 @@ class CrossAttentionFusion(Fusion):
 
 
 class NoFusion(Fusion):
-    """The tokens of all streams side by side: the expert's own attention does the rest."""
+    """The tokens of all streams, concatenated: the expert's own attention does the rest."""
 
     def __init__(self, shapes: Shapes, dim: int) -> None:
         super().__init__()
@@ -189,7 +189,7 @@ class NoFusion(Fusion):
         self.norm = nn.LayerNorm(dim)
 
     def forward(self, encoded: Tokens) -> Context:
-        """The context of as many tokens as the encoders give together."""
+        """The context, with all tokens of the encoders."""
         return self.norm(torch.cat([*self.tokens(encoded).values()], dim=1))
 
 
@@ -202,5 +202,5 @@ _FUSIONS: dict[str, Callable[[Shapes, int, int], Fusion]] = {
 
 
 def build_fusion(strategy: str, shapes: Shapes, dim: int, heads: int) -> Fusion:
-    """The fusion of this name for encoders of these `shapes`; `heads` is that of its attention."""
+    """The fusion of this name for encoders of these `shapes`; its attention has `heads`."""
     return _FUSIONS[strategy](shapes, dim, heads)

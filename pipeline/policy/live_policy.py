@@ -1,4 +1,4 @@
-"""A policy with a model in front, which computes the features of some or all samples."""
+"""A policy with a model in front that computes the features of some or all samples."""
 
 from collections.abc import Callable, Generator, Iterator, Mapping
 from contextlib import contextmanager
@@ -46,13 +46,13 @@ class LivePolicy(Trainable, Generic[Model]):
     def named_parameters(
         self, prefix: str = "", recurse: bool = True, remove_duplicate: bool = True
     ) -> Iterator[tuple[str, nn.Parameter]]:
-        """All parameters, so that an optimizer sees those of a tuned model too."""
+        """All parameters, those of a tuned model included, so that an optimizer sees them."""
         if self._tuned:
             self.load_vlm()
         return super().named_parameters(prefix, recurse, remove_duplicate)
 
     def state_dict(self, *arguments: Any, **named: Any) -> dict[str, Any]:
-        """Weights of the policy and of a tuned model; a frozen one's stand in its checkpoint."""
+        """Weights of the policy and of a tuned model; a frozen model has its own checkpoint."""
         if self._tuned:
             self.load_vlm()
         state = super().state_dict(*arguments, **named)
@@ -63,7 +63,7 @@ class LivePolicy(Trainable, Generic[Model]):
     def load_state_dict(
         self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False
     ) -> Any:
-        """Take the weights of `state_dict()`, wherever a model was loaded, there or here."""
+        """Load the weights of `state_dict()`, whether or not a model was loaded there or here."""
         if self._tuned:
             self.load_vlm()
         elif self.vlm is not None:
@@ -78,7 +78,7 @@ class LivePolicy(Trainable, Generic[Model]):
         action_valid: StepMask,
         generator: torch.Generator | None = None,
     ) -> Losses:
-        """As `Policy.loss`; gradients reach the model where a sample is live and it learns."""
+        """As `Policy.loss`; gradients of live samples reach a model that learns."""
         return self.policy.loss(self._seen(observation), action, action_valid, generator)
 
     @torch.no_grad()
@@ -89,9 +89,9 @@ class LivePolicy(Trainable, Generic[Model]):
         generator: Generators = None,
         guide: Guide | None = None,
     ) -> Float[Tensor, "sample batch horizon action"]:
-        """As `Policy.sample`, but never with dropout, whatever the mode; the model runs once.
+        """As `Policy.sample`, but without dropout in any mode; the model runs once.
 
-        Equal generators give equal samples. The mode of every part is afterwards what it was.
+        Equal generators give equal samples. Every part keeps its mode.
         """
         with self._evaluating():
             return self.policy.sample(self._seen(observation), samples, generator, guide)
@@ -118,7 +118,7 @@ class LivePolicy(Trainable, Generic[Model]):
             yield
         finally:
             for part in self.modules():
-                # A model that was loaded meanwhile takes the mode of the whole.
+                # A model that was loaded meanwhile gets the mode of the whole.
                 part.training = modes.get(part, modes[self])
 
     def _seen(self, observation: Observation) -> Observation:

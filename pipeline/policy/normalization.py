@@ -1,4 +1,4 @@
-"""Per-channel mean and standard deviation: fitted in one streaming pass, kept exactly in JSON.
+"""Mean and standard deviation per channel: fitted in one streaming pass, kept exactly in JSON.
 
 Numpy only; `pipeline.policy.policy.Normalizer` applies them to tensors.
 """
@@ -18,27 +18,27 @@ from pipeline.base.arrays import first_non_finite
 from pipeline.base.errors import NumericsError
 
 Block = NDArray[Any] | tuple[NDArray[Any], NDArray[np.bool_]]
-"""Rows of values, or such rows and which of their values are valid."""
+"""Rows of values, or rows of values and which of them are valid."""
 
 Reading = Block | Callable[[], Block]
-"""A block, or what reads one on one of several threads."""
+"""A block, or a function that reads one, on one of several threads."""
 
 _PIECE_VALUES = 4_194_304
 """Values converted to float64 at a time: 32 MB, whatever the size of the blocks."""
 
 _LEAST_SPREAD = 0.05
-"""Of what is usual for inputs alike: what rested in training is noise, and may move later."""
+"""A share of the usual spread of similar inputs: what rested in training may move later."""
 
 _TINY = float(np.finfo(np.float32).tiny)
 _RELATIVE_FLOOR = 4 * float(np.finfo(np.float32).eps)
 """A spread below a few float32 steps of the mean is rounding, not signal."""
 
 _MOST = 1e30
-"""Of a number in a document: what divides by it or multiplies stays finite in float32."""
+"""The largest number in a document: products and quotients stay finite in float32."""
 
 
 def _read_from(least: float) -> GetPydanticSchema:
-    """How a document's numbers, of one axis or of two, become an array."""
+    """The schema by which a document's numbers, of one axis or of two, become an array."""
     row = tuple[Annotated[float, Field(ge=least, le=_MOST)], ...]
     numbers = Annotated[row | tuple[row, ...], AfterValidator(_array)]
     return GetPydanticSchema(lambda source, handler: handler(numbers))
@@ -64,9 +64,9 @@ class ChannelStatistics:
 
     @property
     def scale(self) -> NDArray[np.float64]:
-        """What to divide by: `std`, or 1 where the channel does not vary.
+        """The divisor: `std`, or 1 where the channel does not vary.
 
-        So a constant channel comes out as 0 and inverts exactly.
+        So a constant channel becomes 0 and inverts exactly.
         """
         return np.where(self._varies, self.std, 1.0)
 
@@ -80,20 +80,20 @@ class ChannelStatistics:
         return self.std > np.maximum(_RELATIVE_FLOOR * np.abs(self.mean), _TINY)
 
     def floored(self, usual: NDArray[np.float64]) -> "ChannelStatistics":
-        """The same, of which no spread is far below what is `usual` for channels alike.
+        """These statistics with every spread raised to 5 % of the `usual` one, at least.
 
-        `usual` broadcasts to the channels, 0 where nothing is known of any alike.
+        `usual` is the spread of similar channels; it broadcasts, 0 where there are none.
         """
         return replace(self, std=np.maximum(self.std, _LEAST_SPREAD * usual))
 
     def document(self) -> dict[str, Any]:
-        """The statistics as JSON values; Python writes the shortest digits that read back equal."""
+        """The statistics as JSON values; Python writes the shortest digits that read equal."""
         return {"mean": self.mean.tolist(), "std": self.std.tolist(), "count": self.count}
 
 
 @dataclass(frozen=True, eq=False)
 class Normalization:
-    """The statistics of every stream a policy sees; None for a stream it does not have."""
+    """The statistics of every stream that a policy sees; None for a stream that it lacks."""
 
     action: ChannelStatistics
     features: ChannelStatistics | None = None
@@ -109,11 +109,11 @@ def fit_channels(blocks: Iterable[Reading], what: str, threads: int = 1) -> Chan
     """Statistics over all rows of `blocks`, each (row, channel…) of floating point, in one pass.
 
     A block may be a pair (values, valid): `valid` is bool over the leading axes of `values`, such
-    as (row, slot) for features (row, slot, dim), and what is not valid is neither checked nor
+    as (row, slot) for features (row, slot, dim); values that are not valid are neither checked nor
     counted. Moments are merged in float64 after Chan, Golub and LeVeque (1983), eq. 2.1, in the
-    order of the blocks: the same bits, however many `threads` read them. A few blocks are read at a
-    time, so that memory does not grow with their number.
-    Raises `NumericsError`, naming `what` and the channel, on NaN, inf, or where there is no row.
+    order of the blocks, so the bits do not depend on the number of `threads` that read them. A few
+    blocks are read at a time, so memory does not grow with their number. Raises `NumericsError`,
+    naming `what` and the channel, on NaN or inf, or where there is no row.
     """
     waiting, total = iter(blocks), None
     with ThreadPoolExecutor(threads) as pool:

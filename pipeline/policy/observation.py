@@ -1,4 +1,4 @@
-"""Observations of a policy, and the check of those made by hand against its shape."""
+"""Observations of a policy, and how they are made and checked against its shape."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -16,8 +16,8 @@ from pipeline.policy.ages import even_ages
 from pipeline.policy.shape import Axes, PolicyShape
 
 VALIDITY = {"features": "slot_valid", "sensor": "sensor_valid", "state": "state_valid"}
-"""The streams that a policy may encode, in the order of its encoders, and the field of what is real
-in a stream: (batch, slot) bool of the features, else (batch,) counts."""
+"""The streams that a policy may encode, in the order of its encoders, and the field that says which
+of their values are real: (batch, slot) bool for features, else (batch,) counts."""
 
 AGES = {"sensor": "sensor_age", "state": "state_age"}
 """The field with the ages of a stream's readings."""
@@ -36,7 +36,7 @@ class LiveObservation(Observation):
 def moving_channels(action: Mapping[str, Any]) -> tuple[bool, ...]:
     """Which channels of a store's `streams["action"]` are motions: deltas and velocities.
 
-    Not a gripper's, which is a position in every format.
+    A gripper's channel is not: it is a position in every format.
     """
     moves = action["kind"] != "absolute"
     groups = action_groups(action["names"], action["units"])
@@ -60,15 +60,17 @@ def build_observation(
 ) -> LiveObservation:
     """The observation with the `given` fields; other streams are missing.
 
-    Without its `*_valid` a stream is all real, without `*_age` its readings spread evenly over the
-    seconds of its window. Without `feature_age` features are new, without `view_age` all views are
-    as old as the features. Raises `ObservationError` for a `*_valid` or an age without its
-    stream, and for a shape that is not the policy's or not the batch's.
+    Without its `*_valid`, all of a stream is real; without `*_age`, its readings are spread evenly
+    over the seconds of its window. Without `feature_age`, features are new; without `view_age`, all
+    views are as old as the features. Raises `ObservationError` for a `*_valid` or an age without
+    its stream, and for a shape that is not the policy's or not the batch's.
     """
     for name in given:
         describes = name.endswith("_valid") or name in AGES.values()
         if describes and stream_of(name) not in given:
-            raise ObservationError(f"{name}: expected {stream_of(name)} beside it, which it is of")
+            raise ObservationError(
+                f"{name}: expected {stream_of(name)} beside it, which it describes"
+            )
     first = next((name for name in VALIDITY if name in given), "images")
     index = torch.tensor(row_of, dtype=torch.int64, device=device)
     # A scalar has no len; `check_axes` refuses its shape below.
@@ -111,7 +113,7 @@ def with_features(
     features: Float[Tensor, "row slot dim"],
     slot_valid: Bool[Tensor, "row slot"],
 ) -> Observation:
-    """The observation with the features of its rows, where a sample has a row."""
+    """The observation with its rows' features in the samples that have a row."""
     given = {name: getattr(observation, name) for name in Observation.__dataclass_fields__}
     row_of = observation.row_of.to(features.device)
     live, index = row_of >= 0, row_of.clamp(min=0)

@@ -2,24 +2,21 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
+from copy import deepcopy
 from typing import Any
 
 import torch
 from jaxtyping import Float
 from torch import Generator, Tensor, nn
+from torch.nn.attention import SDPBackend, sdpa_kernel
+from torch.utils.flop_counter import FlopCounterMode
 
 from pipeline.base.config import TrainHeadParams
-from pipeline.base.errors import ConfigError, ObservationError
+from pipeline.base.errors import ObservationError
 from pipeline.base.observation import Observation
 from pipeline.base.source import CLOCK_SLACK_S
-from pipeline.policy.anchoring import Anchoring
 from pipeline.policy.diffusion import DiffusionActionExpert
-from pipeline.policy.encoders import (
-    FeatureEncoder,
-    ForceAwareSensorEncoder,
-    RobotStateEncoder,
-    SensorEncoder,
-)
+from pipeline.policy.encoders import build_encoders
 from pipeline.policy.expert import (
     ActionExpert,
     Chunk,
@@ -37,12 +34,12 @@ from pipeline.policy.observation import (
     AGES,
     VALIDITY,
     LiveObservation,
-    PolicyShape,
     build_observation,
     stream_of,
 )
 from pipeline.policy.regression import RegressionActionExpert
-from pipeline.policy.state_channels import expand
+from pipeline.policy.robot_state import Anchoring, expand
+from pipeline.policy.shape import PolicyShape
 
 EXPERTS: dict[str, type[ActionExpert]] = {
     "regression": RegressionActionExpert,
@@ -51,16 +48,9 @@ EXPERTS: dict[str, type[ActionExpert]] = {
 }
 """The class of each `train_head.model_type`."""
 
-SENSOR_ENCODERS: dict[str, type[SensorEncoder] | type[ForceAwareSensorEncoder]] = {
-    "joint": SensorEncoder,
-    "force_aware": ForceAwareSensorEncoder,
-}
-"""The class of each `train_head.sensor_encoder.kind`."""
-
-
 _LARGEST = 10.0
-"""Inputs are held within so many deviations of the training mean: a channel that rested in training
-and moves later must not drown the others."""
+"""Inputs are clipped to so many deviations from the training mean: a channel that rested in
+training and moves later must not drown the others."""
 
 
 class Trainable(nn.Module, ABC):
@@ -87,7 +77,7 @@ class Trainable(nn.Module, ABC):
         """Action chunks in physical units, float32.
 
         With a guide, also in physical units, they continue its chunk; only a `stochastic` policy
-        takes one.
+        takes a guide.
         """
 
     def act(
@@ -99,7 +89,7 @@ class Trainable(nn.Module, ABC):
     @property
     @abstractmethod
     def stochastic(self) -> bool:
-        """Whether two samples differ; if not, any number of them costs one."""
+        """Whether two samples differ; if not, any number of samples costs as much as one."""
 
     @abstractmethod
     def parameter_table(self) -> list[tuple[str, int]]:
@@ -131,14 +121,14 @@ class Normalizer(nn.Module):
 
 
 class Policy(Trainable):
-    """Encoders of the streams that are both present and enabled, fusion, expert.
+    """Encoders of the streams that are both present and enabled, a fusion and an expert.
 
-    Raises `ConfigError` where no stream is left. The state dict holds weights and noise schedule;
-    the statistics, which must fit the shape, travel beside it.
+    Raises `ConfigError` where no stream is left. The state dict has the weights and the noise
+    schedule; the statistics, which must fit the shape, travel in the checkpoint's JSON.
     """
 
     feature_spec: Mapping[str, Any] | None = None
-    """Of the features it was trained on; None without a checkpoint."""
+    """The spec of the features that it was trained on; None without a checkpoint."""
 
     def __init__(
         self, params: TrainHeadParams, shape: PolicyShape, normalization: Normalization
@@ -164,7 +154,7 @@ class Policy(Trainable):
     def context(
         self, observation: Observation, validity: Mapping[str, Tensor] | None = None
     ) -> Context:
-        """What the expert attends to; by default every valid part of the observation."""
+        """The context of the expert; by default from every valid part of the observation."""
         return self.fusion(
             {
                 name: self.encode(name, observation, valid)
@@ -181,8 +171,8 @@ class Policy(Trainable):
     ) -> Losses:
         """The scalar to minimise and its detached parts by action group; `action` is physical.
 
-        While training, streams of some samples go missing at the rates of `train_head.drop_*`;
-        see `drop_streams`. `generator` draws these and what the expert draws.
+        While training, streams of some samples are dropped at the rates of `train_head.drop_*`
+        (`drop_streams`). `generator` draws these and the expert's noise.
         """
         validity = self._validity(observation)
         if self.training and any(self.drop_rates.values()):
@@ -202,8 +192,8 @@ class Policy(Trainable):
     ) -> Float[Tensor, "sample batch horizon action"]:
         """Action chunks in physical units, float32; call `eval()` first to silence dropout.
 
-        The context is computed once. Where the policy is not stochastic all samples are one. A
-        guide is in physical units, and of the batch: all samples have the same.
+        The context is computed once. Where the policy is not stochastic, all samples are the same.
+        All samples of a batch share the guide, which is in physical units.
         """
         context = self.context(observation)
         repeats = samples if self.stochastic else 1
@@ -245,7 +235,7 @@ class Policy(Trainable):
     def encode(
         self, stream: str, observation: Observation, valid: Tensor
     ) -> Float[Tensor, "batch token width"]:
-        """The tokens of a stream, from the part of it that `valid` counts or marks."""
+        """The tokens of a stream, from the part that `valid` counts or marks."""
         normalizer, encoder = self.normalizers[stream], self.encoders[stream]
         assert isinstance(normalizer, Normalizer)
         values = getattr(observation, stream)
@@ -268,45 +258,6 @@ class Policy(Trainable):
         return {name: getattr(observation, VALIDITY[name]) for name in self.encoders}
 
 
-def build_encoders(
-    params: TrainHeadParams, shape: PolicyShape
-) -> tuple[nn.ModuleDict, dict[str, tuple[int, int]]]:
-    """Encoders of the streams both present and enabled, and how many tokens of what width each.
-
-    Raises `ConfigError` where no stream is left.
-    """
-    encoders, tokens = nn.ModuleDict(), dict[str, tuple[int, int]]()
-    if params.features_enabled and shape.slots and shape.feature_dim:
-        features = FeatureEncoder(shape.slots, shape.feature_dim, views=shape.views)
-        encoders["features"], tokens["features"] = features, (shape.slots, features.width)
-    if params.sensor_enabled and shape.sensor_channels:
-        sensor = params.sensor_encoder
-        encoders["sensor"] = SENSOR_ENCODERS[sensor.kind](
-            shape.sensor_channels,
-            params.sensor_window,
-            span_s=params.sensor_window_s,
-            **sensor.model_dump(exclude={"kind"}),
-        )
-        tokens["sensor"] = (1, sensor.output_dim)
-    if params.robot_state_enabled and shape.state_dim:
-        state = params.state_encoder
-        encoders["state"] = RobotStateEncoder(
-            shape.channels["state"][0],
-            params.state_window,
-            span_s=params.state_window_s,
-            **state.model_dump(),
-        )
-        tokens["state"] = (1, state.output_dim)
-    if not tokens:
-        raise ConfigError(
-            "the policy has nothing to look at: the store has "
-            f"{shape.slots} feature slots, {shape.sensor_channels} sensor channels and "
-            f"{shape.state_dim} state channels. Enable one of these in train_head "
-            "(features_enabled, sensor_enabled, robot_state_enabled)."
-        )
-    return encoders, tokens
-
-
 def build_expert(params: TrainHeadParams, shape: PolicyShape) -> ActionExpert:
     """The action expert of `train_head.model_type`, with the params of the section of that name."""
     return EXPERTS[params.model_type](
@@ -326,8 +277,8 @@ def drop_streams(
 
     Modality dropout (Neverova et al. 2016, "ModDrop") teaches a policy to use the streams it has.
     Streams are dropped independently, but a sample never loses all of its streams: one of them,
-    each as likely, is then kept. With rates p and q of two streams, the first is
-    thus missing from p - pq/2 of the samples that have both.
+    with equal probability, is then kept. So with rates p and q of two streams, the first is missing
+    from p - pq/2 of the samples that have both.
     """
     device = next(iter(validity.values())).device
     present = torch.stack([v.reshape(len(v), -1).gt(0).any(dim=1) for v in validity.values()], 1)
@@ -343,3 +294,40 @@ def drop_streams(
         name: valid.masked_fill(gone.view(-1, *[1] * (valid.ndim - 1)), 0)
         for (name, valid), gone in zip(validity.items(), dropped.unbind(dim=1), strict=True)
     }
+
+
+def flop_table(policy: Policy) -> list[tuple[str, int]]:
+    """The floating-point operations of one `act` at one tick, by the parts of `parameter_table`.
+
+    It counts matrix products, convolutions and attention, a multiply-add as two, but not norms and
+    activations. Windows are as long as in `train_head`. The policy and the global generators do not
+    change.
+    """
+    # A frozen copy: the counter's hooks fail on views of parameters that learn.
+    frozen = deepcopy(policy).requires_grad_(False).eval()
+    params, shape = frozen.params, frozen.shape
+    sizes = {
+        "features": (shape.slots, shape.feature_dim),
+        "sensor": (params.sensor_window, shape.sensor_channels),
+        "state": (params.state_window, shape.state_dim),
+    }
+    blank = frozen.observe({name: torch.zeros(1, *size) for name, size in sizes.items()})
+    generator = Generator(blank.features.device).manual_seed(0)
+    # Not every device counts fused attention kernels; the plain one is counted everywhere.
+    with FlopCounterMode(display=False) as counter, sdpa_kernel(SDPBackend.MATH):
+        frozen.act(blank, generator)
+    parts = {**dict(frozen.encoders.items()), "fusion": frozen.fusion}
+    counted = counter.get_flop_counts()  # by the class of what was called
+    table = [(n, sum(counted.get(type(part).__name__, {}).values())) for n, part in parts.items()]
+    return [*table, ("expert", counter.get_total_flops() - sum(flops for _, flops in table))]
+
+
+def describe_cost(policy: Policy) -> list[str]:
+    """Two lines for the user: parameters, and FLOPs of one `act` at one tick, by part."""
+    parameters, flops = policy.parameter_table(), flop_table(policy)
+    counts = ", ".join(f"{name} {count:,}" for name, count in parameters)
+    costs = ", ".join(f"{name} {count / 1e6:,.1f}" for name, count in flops)
+    return [
+        f"parameters: {sum(count for _, count in parameters):,} ({counts})",
+        f"one act: {sum(count for _, count in flops) / 1e6:,.1f} MFLOP a tick ({costs})",
+    ]

@@ -12,9 +12,9 @@ from pipeline.policy.expert import ActionExpert, Chunk, Context, Generators, Gui
 class RegressionActionExpert(ActionExpert):
     """A transformer decoder from learned queries, one a step of the horizon.
 
-    The chunk is refined `refinements` times: each round reads the proposal of the round before,
-    the first one zeros, and adds to it. `predict` takes the context and nothing else, and both
-    `loss` and `act` go through it, so a target cannot become an input.
+    The chunk is refined `refinements` times: each round reads the proposal of the round before
+    (the first reads zeros) and adds to it. `predict` takes the context and nothing else, and both
+    `loss` and `act` use it, so a target cannot become an input.
     """
 
     stochastic = False

@@ -1,5 +1,6 @@
 """The shape of a policy: the widths of its streams and the kinds of its channels. No torch."""
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal
@@ -9,14 +10,14 @@ from pydantic import ConfigDict, Field
 from pipeline.base.errors import ConfigError
 
 MOST = 1_000_000
-"""Channels of a stream, slots or widths of features."""
+"""The most channels of a stream, slots or widths of features."""
 Size = Annotated[int, Field(ge=0, le=MOST)]
 Group = Annotated[str, Field(pattern="^(translation|rotation|gripper|other)$")]
 Axes = Mapping[str, int | None]
 """Names and sizes of a tensor's axes; None is any size above 0."""
 
 Kind = Literal["plain", "deg", "rad", "rotation"]
-"""Of a channel: plain; an angle; one of the three angles, in degrees, of a pose's rotation."""
+"""A channel is plain, an angle, or one of the three angles (deg) of a pose's rotation."""
 
 _POSE_ANGLES = ("pose_a", "pose_b", "pose_r")
 _ANGLES: dict[str, Kind] = {"deg": "deg", "rad": "rad"}
@@ -42,12 +43,31 @@ def expanded_names(names: Sequence[str], kinds: Sequence[Kind]) -> list[str]:
     return [*plain, *waves, *(_SIX if "rotation" in kinds else ())]
 
 
+def typical_state(mean: Sequence[float], kinds: Sequence[Kind]) -> list[float]:
+    """The state (channel,) whose expansion is nearest to the mean (expanded,).
+
+    Rotations are 0: relative to itself, a reading has none.
+    """
+    if not {*kinds} - {"plain"}:
+        return list(mean)
+    plain, angles = kinds.count("plain"), kinds.count("deg") + kinds.count("rad")
+    waves = mean[plain : plain + 2 * angles]
+    known = iter(mean[:plain])
+    turned = iter(zip(waves[:angles], waves[angles:], strict=True))
+    state: list[float] = []
+    for kind in kinds:
+        angle = math.atan2(*next(turned)) if kind in ("deg", "rad") else 0.0
+        written = math.degrees(angle) if kind == "deg" else angle
+        state.append(next(known) if kind == "plain" else written)
+    return state
+
+
 @dataclass(frozen=True)
 class Anchor:
     """Action channels that count from the state when the newest frame was taken.
 
-    `state` are the channels of the state that tell their motion. `composed` is for a rotation
-    vector, which the three angles of the arm's pose tell; the others are added.
+    `state` are the channels of the state that measure their motion. A rotation vector is
+    `composed` with the rotation of the three angles of the arm's pose; other channels are added.
     """
 
     __pydantic_config__ = ConfigDict(strict=True, extra="forbid")
@@ -60,11 +80,11 @@ class Anchor:
 def find_anchors(
     action: Mapping[str, Any], state: Mapping[str, Any], wanted: Sequence[str]
 ) -> tuple[Anchor, ...]:
-    """Which channels of the state tell the motion of these action channels, of a store's streams.
+    """The anchors of the `wanted` action channels; `action` and `state` are streams of a store.
 
-    The delta `dx` is told by `x` or `pose_x` in the same unit, `joint_1` by `joint_1`; the rotation
-    vector `rx`, `ry`, `rz`, which is anchored whole, by the angles of the arm's pose. Raises
-    `ConfigError` naming a channel that is no such delta.
+    The delta `dx` is measured by `x` or `pose_x` in the same unit, `joint_1` by `joint_1`; the
+    rotation vector `rx`, `ry`, `rz`, which is anchored as a whole, by the angles of the arm's pose.
+    Raises `ConfigError` naming a channel that is no such delta.
     """
     told = told_deltas(action, state)
     whole = {*_ROTVEC} <= {*wanted} & {*action["names"]} and {*_POSE_ANGLES} <= {*state["names"]}
@@ -82,7 +102,7 @@ def find_anchors(
 
 
 def told_deltas(action: Mapping[str, Any], state: Mapping[str, Any]) -> dict[str, int]:
-    """The delta channels of the action that are anchored alone, and the state's channel of each."""
+    """The delta channels that can be anchored one by one, each with its channel of the state."""
     deltas = zip(action["names"], action["units"], strict=True) if action["kind"] == "delta" else ()
     return {name: place for name, unit in deltas if (place := _told(name, unit, state)) is not None}
 
@@ -97,7 +117,7 @@ def _told(name: str, unit: str, state: Mapping[str, Any]) -> int | None:
 
 @dataclass(frozen=True)
 class PolicyShape:
-    """The widths that a store gives to a policy; 0 where the store lacks the stream.
+    """The widths of a policy's streams; 0 where the store lacks the stream.
 
     The bounds hold where a checkpoint's document is read.
     """
@@ -110,11 +130,11 @@ class PolicyShape:
     state_dim: Size
     action_dim: Annotated[int, Field(ge=1, le=MOST)]
     action_groups: tuple[Group, ...]
-    """Of each action channel."""
+    """The group of each action channel."""
     views: Size = 0
     """Views whose ages are inputs."""
     state_kinds: tuple[Kind, ...] = ()
-    """Of each state channel; empty where all are plain."""
+    """The kind of each state channel; empty where all are plain."""
     anchors: tuple[Anchor, ...] = ()
     """Action channels that count from the newest frame; the others from the tick."""
 
@@ -126,7 +146,7 @@ class PolicyShape:
 
     @property
     def channels(self) -> dict[str, tuple[int, ...]]:
-        """The shape of each stream's statistics, and of the action's; a state's is expanded."""
+        """The shape of each stream's statistics and of the action's; states are expanded."""
         expanded = expanded_names([""] * self.state_dim, self.kinds)
         return {
             "features": (self.slots, self.feature_dim),
@@ -146,7 +166,7 @@ class PolicyShape:
             "slot_valid": {"slot": self.slots},
             "feature_age": {},
             "view_age": {"view": self.views},
-            # Of any length: readings have steps by their ages.
+            # Windows of any length: readings are placed by their ages.
             "sensor": {"window": None, "channel": self.sensor_channels},
             "sensor_valid": {},
             "sensor_age": {"window": None},

@@ -18,7 +18,7 @@ from scipy.optimize import linear_sum_assignment
 
 from pipeline.base.errors import ObservationError
 from pipeline.policy.checkpoint import PolicyCheckpoint
-from pipeline.policy.state_channels import expand
+from pipeline.policy.robot_state import expand
 
 Palette = NDArray[np.float64]
 """Sorted grey levels of a frame; they do not depend on where things stand in it."""

@@ -12,10 +12,9 @@ from pipeline.base.border import Document, Text
 from pipeline.base.differences import describe, differences
 from pipeline.base.errors import CheckpointMismatch
 from pipeline.base.files import read_document, read_tensors, write_tensors, write_with_digest
-from pipeline.policy.checkpoint import load_policy
-from pipeline.policy.document import Sha256
+from pipeline.policy.checkpoint import Sha256, load_policy
 from pipeline.policy.normalization import Normalization
-from pipeline.policy.observation import PolicyShape
+from pipeline.policy.shape import PolicyShape
 from pipeline.train.process_group import ProcessGroup
 from pipeline.train.run import TRAINER_DOCUMENT, TRAINER_WEIGHTS, TrainingRun
 

@@ -17,13 +17,11 @@ from pipeline.base.files import sync
 from pipeline.base.machine import use_bfloat16
 from pipeline.base.text import duration, size
 from pipeline.policy.checkpoint import PolicyCheckpoint, save_policy
-from pipeline.policy.cost import describe_cost
 from pipeline.policy.observation import moving_channels
-from pipeline.policy.policy import Policy, Trainable
+from pipeline.policy.policy import Policy, Trainable, describe_cost
 from pipeline.store import Batch, FeatureStore
-from pipeline.train.batches import BatchIndices, Windows, choose_feed, evenly
+from pipeline.train.batches import BatchIndices, FeatureSource, Windows, choose_feed, evenly
 from pipeline.train.checkpoints import load_weights, of_kind, read_last, write_trainer
-from pipeline.train.feature_source import FeatureSource
 from pipeline.train.log import History, Row, TrainingLog, open_log
 from pipeline.train.optimizer import (
     WeightAverage,

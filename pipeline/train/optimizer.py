@@ -12,7 +12,7 @@ from torch.optim.swa_utils import get_ema_multi_avg_fn
 from pipeline.base.config import TrainHeadParams
 from pipeline.base.errors import ConfigError
 from pipeline.policy.policy import Trainable
-from pipeline.train.feature_source import FeatureSource
+from pipeline.train.batches import FeatureSource
 
 
 def trainable(module: nn.Module) -> dict[str, nn.Parameter]:

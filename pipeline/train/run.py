@@ -37,8 +37,13 @@ from pipeline.base.files import (
     write_with_digest,
 )
 from pipeline.base.source import SourceDocument
-from pipeline.policy.checkpoint import CHECKPOINT, DOCUMENT, SOURCE_KEYS, check_policy
-from pipeline.policy.document import PolicyDocument
+from pipeline.policy.checkpoint import (
+    CHECKPOINT,
+    DOCUMENT,
+    SOURCE_KEYS,
+    PolicyDocument,
+    check_policy,
+)
 from pipeline.policy.normalization import Normalization
 from pipeline.policy.shape import PolicyShape, channel_kinds, find_anchors
 from pipeline.store import FeatureStore, build_lock

@@ -30,6 +30,10 @@ def ticks_by_source(store: FeatureStore, ticks: Ticks) -> dict[str, Ticks]:
     return {name: ticks[sources == name] for name in store.sources}
 
 
+_Tree = tuple[int, "str | tuple[_Tree, _Tree]"]
+"""A mass, and the source or the two parts that have it."""
+
+
 class TickSampler:
     """An endless, resumable mixture of shuffled ticks: each batch is a function of (seed, step).
 
@@ -66,7 +70,7 @@ class TickSampler:
             )
         self.batch_size, self.seed = batch_size, seed
         self.shares = {name: mass / sum(masses.values()) for name, mass in masses.items()}
-        self._forks = _fork(masses)
+        self._tree = _fork(masses)
         self._ticks = {name: ticks_by_source[name] for name in masses}
         self._order = lru_cache(2 * len(masses))(self._shuffle)
 
@@ -81,11 +85,7 @@ class TickSampler:
         At each fork the left side takes its rounded share and the right side the rest, so one more
         draw adds 1 to exactly one source. Rounding each source alone could lower a count again.
         """
-        drawn = {frozenset(self._ticks): draws}
-        for whole, left, right, mass, total in self._forks:
-            drawn[left] = (2 * drawn[whole] * mass + total) // (2 * total)
-            drawn[right] = drawn[whole] - drawn[left]
-        return {name: drawn[frozenset((name,))] for name in self._ticks}
+        return _deal(self._tree, draws)
 
     def _range(self, name: str, start: int, stop: int) -> Ticks:
         """The draws [start, stop) of one source, across epochs."""
@@ -104,23 +104,26 @@ class TickSampler:
         return rng.permutation(len(self._ticks[name]))
 
 
-Sources = frozenset[str]
+def _fork(masses: Mapping[str, int]) -> _Tree:
+    """The tree of the sources, as Huffman's: the two lightest parts are joined until one is left.
 
-
-def _fork(masses: Mapping[str, int]) -> list[tuple[Sources, Sources, Sources, int, int]]:
-    """The forks from the set of all sources down to single ones, as in a Huffman tree.
-
-    Each is (whole, left, right, mass of left, mass of whole). The two lightest sets are joined
-    until one is left. So a heavy source is a fork or two away from the set of all, and few
-    roundings, of half a draw each, add up on the way to it.
+    So a heavy source is a fork or two below the root, and few roundings, of half a draw each, add
+    up on the way to it.
     """
-    sets = [(masses[name], frozenset((name,))) for name in sorted(masses)]
-    forks: list[tuple[Sources, Sources, Sources, int, int]] = []
-    while len(sets) > 1:
-        (mass, left), (other, right), *rest = sorted(sets, key=itemgetter(0))
-        forks.append((left | right, left, right, mass, mass + other))
-        sets = [(mass + other, left | right), *rest]
-    return forks[::-1]
+    trees: list[_Tree] = [(masses[name], name) for name in sorted(masses)]
+    while len(trees) > 1:
+        left, right, *rest = sorted(trees, key=itemgetter(0))
+        trees = [(left[0] + right[0], (left, right)), *rest]
+    return trees[0]
+
+
+def _deal(tree: _Tree, draws: int) -> dict[str, int]:
+    mass, below = tree
+    if isinstance(below, str):
+        return {below: draws}
+    left, right = below
+    share = (2 * draws * left[0] + mass) // (2 * mass)
+    return _deal(left, share) | _deal(right, draws - share)
 
 
 _VARIANTS, _LAGS = (0, 1), (0, 2)

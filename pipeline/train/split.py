@@ -5,16 +5,18 @@ Whole groups of episodes fall on one side, in five steps:
 1. `episodes_by_group` finds the episodes that must stay together.
 2. `_ranks`: a hash of the seed and the group's name gives each group a number in [0, 1).
 3. `_test_groups`: with folds, or with two groups, some groups are test whatever their rank.
-4. `_sides_by_rank`: every other group takes the side whose range holds its rank.
+4. `_ranges`: every other group takes the side whose range of ranks holds its own.
 5. `_fill_empty_sides`: where few groups leave a side empty, the group of the nearest rank moves in.
 
 Where one group is left after step 3, it is cut by time instead (`_cut_by_time`).
 """
 
 import hashlib
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Hashable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from fnmatch import fnmatchcase
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +25,6 @@ from pipeline.base.config import SplitParams
 from pipeline.base.errors import ConfigError, StoreMismatch
 from pipeline.base.source import SIDES, Side
 from pipeline.store import Episode, FeatureStore, episode_name
-from pipeline.train.groups import episodes_by_group
 
 _SHOWN = 5
 """Moved groups that a note lists."""
@@ -31,7 +32,13 @@ _SHOWN = 5
 _SLACK_S = 1e-6
 """Times that differ by less count as equal: float64 seconds since 1970 are this coarse."""
 
+_TOLERANCE, _RESTING = 1e-3, 0.1
+"""How much two equal actions may differ in a channel, as a share of its range in the episode. A
+channel at rest varies only by rounding, so its range counts as at least a tenth of the widest
+channel's."""
+
 Groups = Mapping[str, Sequence[Episode]]
+"""Episodes so alike that a policy trained on one of them in effect knows the others, by name."""
 Ranges = Mapping[Side, tuple[float, float]]
 """The ranks [low, high) of each side."""
 
@@ -91,7 +98,10 @@ def split_by_episode(
         if params.folds is not None:
             ranks = _ranks(rest, f"{params.seed}.{params.fold}")
         ranges = _ranges(shares, len(rest) / len(groups))
-        side_of = _sides_by_rank(rest, ranks, ranges)
+        side_of: dict[str, Side] = {
+            name: next(side for side, (_, high) in ranges.items() if ranks[name] < high)
+            for name in rest
+        }
         notes = _fill_empty_sides(side_of, ranks, ranges, _needs(groups, rest, tuple(ranges)))
         members = {side: [n for n in side_of if side_of[n] == side] for side in ranges}
         members["train"] = sorted(members["train"], key=ranks.__getitem__)[: params.train]
@@ -105,6 +115,83 @@ def split_by_episode(
         groups={episode_name(e): name for name, group in groups.items() for e in group},
         note="; ".join(notes) or None,
     )
+
+
+def episodes_by_group(
+    store: FeatureStore,
+    patterns: Mapping[str, Sequence[str]] | None = None,
+    keys: NDArray[np.uint8] | None = None,
+) -> dict[str, list[Episode]]:
+    """The episodes that have ticks, by group; a group is named by the first "source/id" in it.
+
+    Two episodes share a group if their first VL keys, their files or their actions are equal, if
+    their recordings name the same group, if `patterns` (shell wildcards for "source/id", by group
+    name) of one group match both, or if both share a group with a third episode. Actions are equal
+    if the episodes have the same number of ticks and agree within 0.1 % of their range, so a
+    re-encoded copy is recognised. Actions that never change are not compared. `keys` (vl_row, 16)
+    replace the store's own.
+
+    Raises `ConfigError` if a pattern matches no episode.
+    """
+    from scipy.cluster.hierarchy import DisjointSet  # slow to import, not needed when finished
+
+    episodes = [episode for episode in store.episodes if len(episode.ticks)]
+    keys = store.array("vl/key") if keys is None else keys
+    frame_time = store.array("vl/frame_time")
+    together, first = DisjointSet(range(len(episodes))), dict[Hashable, int]()
+    for index, episode in enumerate(episodes):
+        row = episode.vl_rows.start
+        # Without a frame, a row's key depends on the instruction alone.
+        key = keys[row].tobytes() if np.isfinite(frame_time[row]).any() else b""
+        marks = [("key", key), ("content", episode.content), ("group", episode.group)]
+        for mark in (mark for mark in marks if mark[1]):
+            together.merge(first.setdefault(mark, index), index)
+    for name, index in _fitting(patterns or {}, [episode_name(episode) for episode in episodes]):
+        together.merge(first.setdefault(("params", name), index), index)
+    for pair in _equal_actions(store.array("tick/action"), episodes):
+        together.merge(*pair)
+    groups = ([episodes[i] for i in sorted(members)] for members in together.subsets())
+    return dict(sorted((min(map(episode_name, group)), group) for group in groups))
+
+
+def _fitting(
+    patterns: Mapping[str, Sequence[str]], names: Sequence[str]
+) -> Iterator[tuple[str, int]]:
+    """Yields (group, index in `names`) for each name that a pattern of the group matches."""
+    for group, wanted in patterns.items():
+        for pattern in wanted:
+            places = [i for i, name in enumerate(names) if fnmatchcase(name, pattern)]
+            if not places:
+                raise ConfigError(
+                    f"train_head.split.groups.{group}: expected patterns of episodes of the store, "
+                    f"which are called {', '.join(names[:3])}{' …' if len(names) > 3 else ''}; "
+                    f"{pattern!r} fits none of {len(names)}."
+                )
+            yield from ((group, place) for place in places)
+
+
+def _equal_actions(
+    action: NDArray[np.float32], episodes: Sequence[Episode]
+) -> Iterator[tuple[int, int]]:
+    """Yields the indices in `episodes` of each pair with equal actions (tick, action)."""
+    by_length: dict[int, list[int]] = {}
+    for index, episode in enumerate(episodes):
+        by_length.setdefault(len(episode.ticks), []).append(index)
+    for places in by_length.values():
+        actions = [action[episodes[i].ticks.start : episodes[i].ticks.stop] for i in places]
+        ranges = np.stack([np.ptp(own, axis=0) for own in actions])
+        widest = ranges.max(axis=1, keepdims=True)
+        tolerance = _TOLERANCE * np.maximum(ranges, _RESTING * widest)
+        # First, mean and last action: cheap to compare, and equal where the actions are equal.
+        outline = np.stack([[own[0], own.mean(axis=0, dtype=float), own[-1]] for own in actions])
+        moving = np.flatnonzero((widest[:, 0] > 0) & (widest[:, 0] < np.inf))
+        for rank, own in enumerate(moving):
+            others = moving[rank + 1 :]
+            allowed = np.maximum(tolerance[others], tolerance[own])
+            alike = (np.abs(outline[others] - outline[own]) <= allowed[:, None]).all(axis=(1, 2))
+            for other, within in zip(others[alike], allowed[alike], strict=True):
+                if np.allclose(actions[other], actions[own], rtol=0, atol=within):
+                    yield places[own], places[other]
 
 
 def _ranks(names: Iterable[str], seed: str) -> dict[str, float]:
@@ -142,17 +229,7 @@ def _ranges(shares: Mapping[Side, float], drawn: float) -> Ranges:
     return dict(zip(sides, pairwise((*edges, 1.0)), strict=True))
 
 
-def _sides_by_rank(
-    names: Iterable[str], ranks: Mapping[str, float], ranges: Ranges
-) -> dict[str, Side]:
-    return {
-        name: next(side for side, (_, high) in ranges.items() if ranks[name] < high)
-        for name in names
-    }
-
-
-@dataclass(frozen=True)
-class _Need:
+class _Need(NamedTuple):
     """Each of these sides needs one of these groups."""
 
     of: str
@@ -181,8 +258,7 @@ def _needs(groups: Groups, drawn: Collection[str], sides: tuple[Side, ...]) -> l
         here = frozenset(own.intersection(drawn))
         every_side = len(own) > 2 and len(here) >= len(sides)
         if here and len(own) > 1:
-            needed: tuple[Side, ...] = sides if every_side else ("train",)
-            needs.append(_Need(f"source {source!r}", here, needed, 1))
+            needs.append(_Need(f"source {source!r}", here, sides if every_side else ("train",), 1))
     return [*needs, _Need("all sources", frozenset(drawn), sides, 3 * len(by_source))]
 
 
@@ -197,11 +273,10 @@ def _fill_empty_sides(
     """
     notes: list[str] = []
     for number, need in enumerate(needs, 1):
-        met = needs[:number]
         for side in sorted(need.empty_sides(side_of)):
             low, high = ranges[side]
             change, _, name = min(
-                (_change(side_of, n, side, met), max(low - ranks[n], ranks[n] - high), n)
+                (_change(side_of, n, side, needs[:number]), max(low - ranks[n], ranks[n] - high), n)
                 for n in need.groups
             )
             if change < 0:
@@ -213,11 +288,10 @@ def _fill_empty_sides(
 
 def _change(side_of: Mapping[str, Side], name: str, side: Side, needs: Iterable[_Need]) -> int:
     """The weight of the sides that a move of this group empties, less that of those it fills."""
-    own = [need for need in needs if name in need.groups]
     moved: dict[str, Side] = {**side_of, name: side}
     return sum(
         need.weight * (len(need.empty_sides(moved)) - len(need.empty_sides(side_of)))
-        for need in own
+        for need in needs
     )
 
 

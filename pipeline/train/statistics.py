@@ -18,8 +18,8 @@ from pipeline.base.config import TrainHeadParams
 from pipeline.base.errors import NumericsError
 from pipeline.policy.attention import right_aligned
 from pipeline.policy.normalization import Block, ChannelStatistics, Normalization, fit_channels
+from pipeline.policy.robot_state import expand
 from pipeline.policy.shape import channel_kinds, expanded_names, told_deltas
-from pipeline.policy.state_channels import expand
 from pipeline.store import FeatureStore, place
 from pipeline.train.batches import Ticks, Windows, evenly
 

@@ -1,6 +1,5 @@
 """Small policies and observations."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,10 +12,8 @@ from pipeline.base.config import TrainHeadParams
 from pipeline.base.observation import Observation
 from pipeline.policy.ages import even_ages
 from pipeline.policy.normalization import ChannelStatistics, Normalization
-from pipeline.policy.observation import PolicyShape
 from pipeline.policy.policy import Policy
-
-Make = Callable[..., Any]
+from pipeline.policy.shape import PolicyShape
 
 
 @dataclass
@@ -28,19 +25,19 @@ class Seen(Observation):
 
 
 @pytest.fixture(autouse=True)
-def _seeded() -> None:
+def _seeded():
     torch.manual_seed(0)
 
 
 @pytest.fixture
-def shape() -> PolicyShape:
+def shape():
     """Of a needle insertion with a narrow sensor."""
     groups = ("translation",) * 3 + ("rotation",) * 3 + ("gripper",)
     return PolicyShape(5, 16, 9, 12, 7, groups, views=2)
 
 
 @pytest.fixture
-def observe(shape: PolicyShape) -> Make:
+def observe(shape):
     """`observe(batch=4, sensor_window=13, state_window=25)`: everything valid, random."""
 
     def make(batch: int = 4, sensor_window: int = 13, state_window: int = 25) -> Seen:
@@ -63,7 +60,7 @@ def observe(shape: PolicyShape) -> Make:
 
 
 @pytest.fixture
-def normalization(shape: PolicyShape) -> Normalization:
+def normalization(shape):
     """Statistics that are not the identity, so that a forgotten one shows."""
     rng = np.random.default_rng(0)
 
@@ -79,7 +76,7 @@ def normalization(shape: PolicyShape) -> Normalization:
 
 
 @pytest.fixture
-def small_params() -> Make:
+def small_params():
     """`small_params(**over)`: widths that run in milliseconds, no dropout."""
 
     def make(**over: Any) -> TrainHeadParams:
@@ -96,7 +93,7 @@ def small_params() -> Make:
 
 
 @pytest.fixture
-def build_policy(shape: PolicyShape, normalization: Normalization, small_params: Make) -> Make:
+def build_policy(shape, normalization, small_params):
     """`build_policy(**params)`: a small policy from a fixed seed."""
 
     def make(**over: Any) -> Policy:
@@ -149,13 +146,13 @@ class Mixture:
 
 
 @pytest.fixture(scope="session")
-def two_modes() -> Mixture:
+def two_modes():
     """In 2-D, of unequal weight, far apart for their spread."""
     means = torch.tensor([[-1.0, 0.5], [1.0, -0.5]])
     return Mixture(means, torch.tensor([0.3, 0.7]), 0.1)
 
 
 @pytest.fixture(scope="session")
-def mixture() -> type[Mixture]:
+def mixture():
     """To make others."""
     return Mixture

@@ -1,8 +1,6 @@
 """Chunks that count from the newest frame."""
 
-from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -12,10 +10,9 @@ from scipy.spatial.transform import Rotation
 from pipeline.base.config import TrainHeadParams
 from pipeline.base.errors import ConfigError
 from pipeline.base.observation import Observation
-from pipeline.policy.anchoring import Anchoring, state_at_frame
 from pipeline.policy.expert import Guide
-from pipeline.policy.policy import Policy
-from pipeline.policy.shape import Anchor, PolicyShape, channel_kinds, find_anchors
+from pipeline.policy.robot_state import Anchoring, state_at_frame
+from pipeline.policy.shape import Anchor, channel_kinds, find_anchors
 from pipeline.robot.export import Head, trace
 
 POSE = {
@@ -34,7 +31,7 @@ SPEED = torch.tensor([2.0, 10.0, -3.0, 1.0, 30.0, 20.0, 40.0])
 
 
 @pytest.fixture
-def moving(observe: Callable[..., Any]) -> Any:
+def moving(observe):
     """Four samples of an arm in steady motion; the frame of each is older than the one before."""
     seen = observe(4, 13, 25)
     state = START - seen.state_age[..., None] * SPEED
@@ -43,14 +40,14 @@ def moving(observe: Callable[..., Any]) -> Any:
     return replace(seen, state=state, feature_age=torch.tensor([0.0, 0.03, 0.31, 0.9]))
 
 
-def test_the_state_is_interpolated_on_its_clock(moving: Any) -> None:
+def test_the_state_is_interpolated_on_its_clock(moving):
     change = state_at_frame(moving, KINDS) - moving.state[:, -1]
     turn = torch.tensor([2 * np.pi, *[torch.inf] * 3, 360.0, 360.0, 360.0])
     change = torch.where(turn.isinf(), change, (change + turn / 2) % turn - turn / 2)
     torch.testing.assert_close(change, -moving.feature_age[:, None] * SPEED, atol=2e-4, rtol=0)
 
 
-def test_before_the_first_reading_it_is_that_reading(moving: Any) -> None:
+def test_before_the_first_reading_it_is_that_reading(moving):
     few = replace(moving, state_valid=torch.full((4,), 5))
     few.state_age[:, :-5] = 0
     few.state[:, :-5] = 0
@@ -59,7 +56,7 @@ def test_before_the_first_reading_it_is_that_reading(moving: Any) -> None:
     torch.testing.assert_close(state_at_frame(one, KINDS), one.state[:, -1])
 
 
-def test_a_step_counts_from_the_frame_and_back(moving: Any) -> None:
+def test_a_step_counts_from_the_frame_and_back(moving):
     anchoring = Anchoring(find_anchors(ROTVEC, POSE, ["dx", "dy", "rx", "ry", "rz"]), KINDS)
     chunks = torch.randn(2, 4, 8, 7)
     counted = anchoring.from_frame(chunks, moving)
@@ -78,7 +75,7 @@ def test_a_step_counts_from_the_frame_and_back(moving: Any) -> None:
 
 
 @pytest.mark.parametrize("missing", ["slot_valid", "state_valid"])
-def test_without_frames_or_states_it_counts_from_the_tick(moving: Any, missing: str) -> None:
+def test_without_frames_or_states_it_counts_from_the_tick(moving, missing):
     moving = replace(moving, **{missing: torch.zeros_like(getattr(moving, missing))})
     chunks = torch.randn(4, 8, 7)
     anchoring = Anchoring(find_anchors(ROTVEC, POSE, ["dx"]), KINDS)
@@ -86,7 +83,7 @@ def test_without_frames_or_states_it_counts_from_the_tick(moving: Any, missing: 
         torch.testing.assert_close(count(chunks, moving), chunks)
 
 
-def test_channels_that_the_state_tells() -> None:
+def test_channels_that_the_state_tells():
     joints = {"kind": "delta", "names": ["joint_1", "wrist"], "units": ["rad", "rad"]}
     assert find_anchors(joints, POSE, ["joint_1"]) == (Anchor((0,), (0,)),)
     euler = {**ROTVEC, "names": ["dx", "dy", "dz", "da", "db", "dr", "gripper"]}
@@ -102,19 +99,14 @@ def test_channels_that_the_state_tells() -> None:
             find_anchors(action, POSE, wanted)
 
 
-def test_it_needs_frames_and_states() -> None:
+def test_it_needs_frames_and_states():
     for off in ("features_enabled", "robot_state_enabled"):
         with pytest.raises(ValueError, match="anchor counts from the newest frame"):
             TrainHeadParams.model_validate({"anchor": ["dx"], off: False})
 
 
 @pytest.mark.parametrize("model_type", ["regression", "flow_matching"])
-def test_a_policy_learns_and_answers_from_the_frame(
-    model_type: str,
-    build_policy: Callable[..., Policy],
-    observe: Callable[..., Any],
-    shape: PolicyShape,
-) -> None:
+def test_a_policy_learns_and_answers_from_the_frame(model_type, build_policy, observe, shape):
     plain = build_policy(model_type=model_type).eval()
     anchored = build_policy(model_type=model_type).eval()
     anchored.anchoring = count = Anchoring((Anchor((0,), (3,)),), shape.kinds)
@@ -137,9 +129,7 @@ def test_a_policy_learns_and_answers_from_the_frame(
         torch.testing.assert_close(guided, count.from_tick(wanted, seen))
 
 
-def test_older_readings_tell_the_motion_and_nothing_else(
-    build_policy: Callable[..., Policy], observe: Callable[..., Any]
-) -> None:
+def test_older_readings_tell_the_motion_and_nothing_else(build_policy, observe):
     policy = build_policy(state_window=8, state_window_s=0.3).eval()
     seen = observe(2)
     readings, within = seen.state.shape[1], (seen.state_age <= 0.3).sum(dim=1)
@@ -158,9 +148,7 @@ def test_older_readings_tell_the_motion_and_nothing_else(
     )
 
 
-def test_an_exported_head_counts_likewise(
-    build_policy: Callable[..., Policy], observe: Callable[..., Any], shape: PolicyShape
-) -> None:
+def test_an_exported_head_counts_likewise(build_policy, observe, shape):
     policy = build_policy().eval()
     policy.anchoring = Anchoring((Anchor((0, 1), (3, 4)),), shape.kinds)
     head = Head(policy).requires_grad_(False)

@@ -6,7 +6,6 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import reduce
 from operator import getitem
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -53,10 +52,12 @@ PARAMS = TrainHeadParams.model_validate(
 
 
 @pytest.fixture(scope="module")
-def store(
-    tiny_store: Callable[..., Path], tmp_path_factory: pytest.TempPathFactory
-) -> FeatureStore:
+def store(tiny_store, tmp_path_factory):
     return FeatureStore.open(tiny_store(tmp_path_factory.mktemp("checkpoint")))
+
+
+def seeded() -> torch.Generator:
+    return torch.Generator().manual_seed(5)
 
 
 def part(first: int, stop: int, content: str, group: str) -> EpisodePart:
@@ -64,7 +65,7 @@ def part(first: int, stop: int, content: str, group: str) -> EpisodePart:
 
 
 @pytest.fixture
-def checkpoint(store: FeatureStore) -> PolicyCheckpoint:
+def checkpoint(store):
     normalization = fit_normalization(store, torch.arange(60).numpy(), WINDOWS)
     shape = policy_shape(store, normalization)
     torch.manual_seed(3)
@@ -84,27 +85,25 @@ def checkpoint(store: FeatureStore) -> PolicyCheckpoint:
     )
 
 
-def test_a_checkpoint_comes_back_to_the_bit(
-    checkpoint: PolicyCheckpoint, store: FeatureStore, tmp_path: Path
-) -> None:
+def test_a_checkpoint_comes_back_to_the_bit(checkpoint, store, tmp_path):
     save_policy(tmp_path / "best", checkpoint)
     found = load_policy(tmp_path / "best")
     assert found.params == PARAMS
     assert found.shape == checkpoint.shape
     assert found.source == checkpoint.source
     assert found.split == checkpoint.split
-    assert (found.step, found.metrics) == (7, {"val/error": 1 / 3})
+    assert (found.step, found.metrics, found.golden) == (7, {"val/error": 1 / 3}, ())
+    assert not (tmp_path / "best/golden.safetensors").exists()
     for name, value in checkpoint.weights.items():
         assert torch.equal(found.weights[name], value), name
     batch = store.gather([0, 31], horizon=3, sensor_window=6, state_window=5)
     assert torch.equal(found.policy().act(batch), checkpoint.policy().act(batch))
 
 
-def test_its_description_is_what_serving_needs(
-    checkpoint: PolicyCheckpoint, tmp_path: Path
-) -> None:
+def test_its_description_is_what_serving_needs(checkpoint, tmp_path):
     save_policy(tmp_path / "best", checkpoint)
-    document = json.loads((tmp_path / "best/policy.json").read_text())
+    path = tmp_path / "best/policy.json"
+    document = json.loads(path.read_text())
     assert document["feature_spec"]["digest"] == "tiny-spec"
     assert document["streams"]["action"]["units"] == ["mm", "mm", "mm", "deg", ""]
     assert document["action_hz"] == 10.0
@@ -113,9 +112,31 @@ def test_its_description_is_what_serving_needs(
     left = {"ticks": [0, 30], "content": "0-4", "group": "elsewhere"}
     assert document["split"]["test"] == {"left/episode_004": left}
     assert document["normalization"]["action"]["count"] == 60
+    assert "golden" not in document
+    document["split"]["test"]["left/episode_004"]["ticks"] = [20, 30]
+    path.write_text(json.dumps(document))
+    with pytest.raises(CheckpointIncomplete, match=r"policy\.json: it was altered"):
+        load_policy(tmp_path / "best")
 
 
-def test_a_folder_or_a_run_is_found(checkpoint: PolicyCheckpoint, tmp_path: Path) -> None:
+def test_a_checkpoint_from_before_the_direct_layer_loads(checkpoint, store, tmp_path):
+    """Experts that draw have a linear layer, `direct`, in training alone; once they had none."""
+    params = PARAMS.model_copy(update={"model_type": "flow_matching"})
+    weights = Policy(params, checkpoint.shape, checkpoint.normalization).state_dict()
+    older = {name: value for name, value in weights.items() if ".direct." not in name}
+    assert len(older) == len(weights) - 2
+    save_policy(tmp_path / "best", replace(checkpoint, params=params, weights=older))
+    loaded = load_policy(tmp_path / "best")
+    assert loaded.weights.keys() == weights.keys()
+    batch = store.gather([0, 31], horizon=3, sensor_window=6, state_window=5)
+    acted = [
+        replace(checkpoint, params=params, weights=kept).policy().act(batch, seeded())
+        for kept in (weights, loaded.weights)
+    ]
+    assert torch.equal(*acted)
+
+
+def test_a_folder_or_a_run_is_found(checkpoint, tmp_path):
     save_policy(tmp_path / "head" / "best", checkpoint)
     assert find_policy(tmp_path / "head") == tmp_path / "head/best"
     assert find_policy(tmp_path / "head/best") == tmp_path / "head/best"
@@ -125,36 +146,26 @@ def test_a_folder_or_a_run_is_found(checkpoint: PolicyCheckpoint, tmp_path: Path
 
 
 OVERLAPPING = part(10, 24, "0-5", "g").model_dump(mode="json")
-SLOT = {"layer": 0, "norm": True, "pooling": "mean"}
 
 
 @pytest.mark.parametrize(
     ("place", "value", "said"),
     [
         ("format", 2, "format: expected 3, found 2"),
-        ("step", -1, "step: expected greater than or equal to 0, found -1"),
-        ("shape.action_dim", 0, "shape.action_dim: expected greater than or equal to 1"),
         ("shape.action_groups", ["other"], "shape.action_groups: expected 5, found 1"),
-        ("shape.action_groups", ["banana"] * 5, "action_groups.0: expected a text to match"),
         ("shape.state_kinds", ["deg"] * 3, "shape.state_kinds: expected 0 or 4, found 3"),
         ("shape.slots", 4, "shape.slots: expected 3, found 4"),
         ("shape.feature_dim", 9, "shape.feature_dim: expected 8, found 9"),
-        ("streams.action.names", ["dx"], "streams.action: 1 names, but 5 units"),
         ("streams.views", ["View2"], "feature_spec.views: expected ('View2',), found ('View1',)"),
-        ("feature_spec.slots", [{**SLOT, "layer": "a"}] * 3, "feature_spec.slots.0.layer"),
         ("split", {"train": {}}, "split: expected train, val, test, found train"),
         ("split.train.right/episode_005.ticks", [9, 3], "expected the first before the last"),
         ("split.test.left/b", OVERLAPPING, "found some of '0-5' in both train and test"),
         ("normalization.state", None, "state: expected mean and std of (4,), found None"),
         ("normalization.action.mean", [0.0], "action: expected mean and std of (5,), found ((1,)"),
-        ("weights_sha256", "../../x", "weights_sha256: expected a text to match pattern"),
-        ("params.train_head.future", 1, "params.train_head.future"),
         ("params.train_head.expert.heads", 7, "heads must divide the width"),
     ],
 )
-def test_a_description_that_is_none_is_named(
-    checkpoint: PolicyCheckpoint, tmp_path: Path, place: str, value: object, said: str
-) -> None:
+def test_a_description_that_is_none_is_named(checkpoint, tmp_path, place, value, said):
     save_policy(tmp_path / "best", checkpoint)
     path = tmp_path / "best/policy.json"
     document = read_document(path, dict)[1]
@@ -170,18 +181,10 @@ def test_a_description_that_is_none_is_named(
 
 @pytest.mark.parametrize(
     "content",
-    [
-        b'{"format": 3, "step": NaN}',
-        b'{"format": "\xe9"}',
-        b'{"format":' + b"[" * 100_000,
-        b"[]",
-        None,
-    ],
-    ids=["nan", "latin", "deep", "list", "pipe"],
+    [b'{"format": 3, "step": NaN}', b'{"format":' + b"[" * 100_000, None],
+    ids=["nan", "deep", "pipe"],
 )
-def test_what_is_no_document_is_refused_before_it_is_read(
-    checkpoint: PolicyCheckpoint, tmp_path: Path, content: bytes | None
-) -> None:
+def test_what_is_no_document_is_refused_before_it_is_read(checkpoint, tmp_path, content):
     save_policy(tmp_path / "best", checkpoint)
     path = tmp_path / "best/policy.json"
     path.unlink()
@@ -189,16 +192,6 @@ def test_what_is_no_document_is_refused_before_it_is_read(
     for read in (load_policy, check_policy):
         with pytest.raises(CheckpointIncomplete, match=r"policy\.json: .*Copy it again"):
             read(tmp_path / "best")
-
-
-def test_an_altered_description_is_refused(checkpoint: PolicyCheckpoint, tmp_path: Path) -> None:
-    save_policy(tmp_path / "best", checkpoint)
-    path = tmp_path / "best/policy.json"
-    document = json.loads(path.read_text())
-    document["split"]["test"]["left/episode_004"]["ticks"] = [20, 30]
-    path.write_text(json.dumps(document))
-    with pytest.raises(CheckpointIncomplete, match=r"policy\.json: it was altered"):
-        load_policy(tmp_path / "best")
 
 
 def _first(weights: dict[str, Any], change: Callable[[Any], Any]) -> dict[str, Any]:
@@ -210,26 +203,20 @@ def _first(weights: dict[str, Any], change: Callable[[Any], Any]) -> dict[str, A
     ("change", "said"),
     [
         (lambda w: _first(w, lambda v: v.half()), r'"torch.float16", .* -> \["torch.float32"'),
-        (
-            lambda w: _first(w, lambda v: v[:1]),
-            "does not fit the policy that policy.json describes",
-        ),
         (lambda w: _first(w, lambda v: v * torch.nan), "expected finite numbers, found NaN"),
         (lambda w: {**w, "extra": torch.zeros(3)}, r'extra: \["torch.float32", \[3\]\] -> null'),
         (lambda w: dict(list(w.items())[1:]), r"null -> \[\"torch.float32"),
     ],
-    ids=["float16", "shorter", "nan", "extra", "missing"],
+    ids=["float16", "nan", "extra", "missing"],
 )
-def test_weights_of_another_policy_are_refused(
-    checkpoint: PolicyCheckpoint, tmp_path: Path, change: Callable[..., Any], said: str
-) -> None:
+def test_weights_of_another_policy_are_refused(checkpoint, tmp_path, change, said):
     save_policy(tmp_path / "best", replace(checkpoint, weights=change(checkpoint.weights)))
     with pytest.raises((CheckpointIncomplete, CheckpointMismatch), match=said) as caught:
         load_policy(tmp_path / "best")
     assert str(tmp_path / "best/policy.safetensors") in str(caught.value)
 
 
-def test_missing_weights_are_named(checkpoint: PolicyCheckpoint, tmp_path: Path) -> None:
+def test_missing_weights_are_named(checkpoint, tmp_path):
     save_policy(tmp_path / "best", checkpoint)
     (tmp_path / "best/policy.safetensors").unlink()
     with pytest.raises(CheckpointIncomplete, match=r"policy\.safetensors.*no such file"):
@@ -238,7 +225,7 @@ def test_missing_weights_are_named(checkpoint: PolicyCheckpoint, tmp_path: Path)
 
 class TestGoldenRows:
     @pytest.fixture
-    def golden(self, checkpoint, tiny_golden, tmp_path) -> PolicyCheckpoint:
+    def golden(self, checkpoint, tiny_golden, tmp_path):
         store = FeatureStore.open(tiny_golden(tmp_path, name="golden"))
         return replace(checkpoint, source=source_of(store), golden=store.golden)
 
@@ -254,12 +241,6 @@ class TestGoldenRows:
             assert {*before.frames} == {*after.frames} == {"View1"}
             assert np.array_equal(before.frames["View1"], after.frames["View1"])
             assert after.frames["View1"].dtype == np.uint8
-
-    def test_a_checkpoint_without_them_loads(self, checkpoint, tmp_path):
-        save_policy(tmp_path / "best", checkpoint)
-        assert "golden" not in json.loads((tmp_path / "best/policy.json").read_text())
-        assert not (tmp_path / "best/golden.safetensors").exists()
-        assert load_policy(tmp_path / "best").golden == ()
 
     @pytest.mark.parametrize("harm", ["altered", "gone"])
     def test_damage_is_named(self, golden, tmp_path, harm):
@@ -280,9 +261,6 @@ class TestGoldenRows:
             ("0/frames/View1", torch.zeros(6, 8, 3)),
             ("0/frames/View1", torch.zeros(0, 8, 3, dtype=torch.uint8)),
             ("0/frames/View9", torch.zeros(6, 8, 3, dtype=torch.uint8)),
-            ("0/frames/../../x", torch.zeros(6, 8, 3, dtype=torch.uint8)),
-            ("9/features", torch.zeros(2)),
-            ("0/slot_valid", torch.zeros(3, dtype=torch.int64)),
         ],
     )
     def test_what_is_no_row_of_this_policy_is_named(self, golden, tmp_path, name, value):
@@ -296,7 +274,7 @@ class TestGoldenRows:
             load_policy(tmp_path / "best")
 
 
-def test_anchors_travel(checkpoint: PolicyCheckpoint, tmp_path: Path) -> None:
+def test_anchors_travel(checkpoint, tmp_path):
     shape = replace(checkpoint.shape, anchors=(Anchor((0,), (1,)),))
     save_policy(tmp_path / "policy", replace(checkpoint, shape=shape))
     assert load_policy(tmp_path / "policy").shape == shape

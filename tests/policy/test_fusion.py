@@ -1,46 +1,39 @@
 """What every fusion guarantees for every subset of streams, and what each does on its own."""
 
-from collections.abc import Callable
-
 import pytest
 import torch
-from torch import Tensor
 
-from pipeline.base.errors import ConfigError
 from pipeline.policy.encoders import FeatureEncoder
-from pipeline.policy.fusion import CrossAttentionFusion, Fusion, GatedFusion, NoFusion, build_fusion
+from pipeline.policy.fusion import CrossAttentionFusion, GatedFusion, NoFusion, build_fusion
 
 DIM, HEADS = 16, 2
 STRATEGIES = ("concat", "cross_attention", "gated", "none")
 SHAPES = {"features": (5, 12), "sensor": (1, 6), "state": (1, 8)}
 SUBSETS = [("features",), ("sensor", "state"), tuple(SHAPES)]
-Encode = Callable[..., dict[str, Tensor]]
 
 
 @pytest.fixture(params=SUBSETS, ids="+".join)
-def streams(request: pytest.FixtureRequest) -> tuple[str, ...]:
+def streams(request):
     return request.param
 
 
 @pytest.fixture(params=STRATEGIES)
-def strategy(request: pytest.FixtureRequest) -> str:
+def strategy(request):
     return request.param
 
 
 @pytest.fixture
-def fusion(strategy: str, streams: tuple[str, ...]) -> Fusion:
+def fusion(strategy, streams):
     return build_fusion(strategy, {name: SHAPES[name] for name in streams}, DIM, HEADS)
 
 
 @pytest.fixture
-def encoded(streams: tuple[str, ...]) -> dict[str, Tensor]:
+def encoded(streams):
     return {name: torch.randn(3, *SHAPES[name]) for name in streams}
 
 
 class TestFusionContract:
-    def test_shape(
-        self, fusion: Fusion, encoded: dict[str, Tensor], strategy: str, streams: tuple[str, ...]
-    ) -> None:
+    def test_shape(self, fusion, encoded, strategy, streams):
         felt = len(set(streams) - {"features"})
         tokens = {
             "concat": 4,
@@ -52,9 +45,7 @@ class TestFusionContract:
         assert context.shape == (3, tokens[strategy], DIM)
         assert context.dtype == torch.float32
 
-    def test_every_token_of_every_stream_reaches_the_context(
-        self, fusion: Fusion, encoded: dict[str, Tensor]
-    ) -> None:
+    def test_every_token_of_every_stream_reaches_the_context(self, fusion, encoded):
         context = fusion(encoded)
         for name, tokens in encoded.items():
             for token in range(tokens.shape[1]):
@@ -63,9 +54,7 @@ class TestFusionContract:
                 moved = (fusion(encoded | {name: changed}) - context).abs()
                 assert moved.amax(dim=(1, 2)).min() > 1e-3, (name, token)
 
-    def test_gradient_reaches_every_weight_and_every_token(
-        self, fusion: Fusion, encoded: dict[str, Tensor]
-    ) -> None:
+    def test_gradient_reaches_every_weight_and_every_token(self, fusion, encoded):
         encoded = {name: tokens.requires_grad_() for name, tokens in encoded.items()}
         context = fusion(encoded)
         (context * torch.randn_like(context)).sum().backward()
@@ -73,9 +62,7 @@ class TestFusionContract:
             assert tensor.grad is not None, name
             assert tensor.grad.abs().max() > 0, name
 
-    def test_no_stream_drowns_the_others_by_its_scale(
-        self, fusion: Fusion, encoded: dict[str, Tensor], strategy: str
-    ) -> None:
+    def test_no_stream_drowns_the_others_by_its_scale(self, fusion, encoded, strategy):
         """Where several tokens are projected together, what counts is their mean and bias."""
         context = fusion(encoded)
         for name, tokens in encoded.items():
@@ -85,25 +72,14 @@ class TestFusionContract:
             if name != "features" or strategy in ("cross_attention", "none"):
                 torch.testing.assert_close(loud, context, atol=1e-3, rtol=1e-3)
 
-    def test_samples_do_not_mix(self, fusion: Fusion, encoded: dict[str, Tensor]) -> None:
-        together = fusion(encoded)
-        alone = [
-            fusion({name: t[row : row + 1] for name, t in encoded.items()}) for row in range(3)
-        ]
-        torch.testing.assert_close(together, torch.cat(alone), atol=1e-5, rtol=1e-4)
-
-    def test_bf16_autocast_is_near_float32(
-        self, fusion: Fusion, encoded: dict[str, Tensor]
-    ) -> None:
+    def test_bf16_autocast_is_near_float32(self, fusion, encoded):
         exact = fusion(encoded)
         with torch.autocast("cpu", dtype=torch.bfloat16):
             rough = fusion(encoded)
         torch.testing.assert_close(rough.float(), exact, atol=0.06, rtol=0.06)
 
 
-def test_what_stands_in_an_invalid_slot_never_reaches_the_context(
-    strategy: str,
-) -> None:
+def test_what_stands_in_an_invalid_slot_never_reaches_the_context(strategy):
     """The features' mask ends in the encoder, as an embedding that every fusion can see."""
     encoder = FeatureEncoder(5, 16)
     fusion = build_fusion(strategy, {"features": (5, encoder.width)}, DIM, HEADS)
@@ -116,44 +92,22 @@ def test_what_stands_in_an_invalid_slot_never_reaches_the_context(
     assert (seen - context).abs().amax(dim=(1, 2)).min() > 1e-2
 
 
-def test_heads_that_do_not_divide_the_width_are_refused() -> None:
-    with pytest.raises(ConfigError, match="16 wide cannot have 3 heads"):
-        build_fusion("cross_attention", SHAPES, DIM, 3)
-
-
 class TestGates:
     @pytest.fixture
-    def fusion(self) -> GatedFusion:
+    def fusion(self):
         return GatedFusion(SHAPES, DIM)
 
     @pytest.fixture
-    def encoded(self) -> dict[str, Tensor]:
+    def encoded(self):
         return {name: torch.randn(3, *shape) for name, shape in SHAPES.items()}
 
-    def test_they_lie_between_0_and_1(
-        self, fusion: GatedFusion, encoded: dict[str, Tensor]
-    ) -> None:
-        for scale in (1.0, 1e4):
-            gates = fusion.gates(
-                fusion.vectors({name: scale * tokens for name, tokens in encoded.items()})
-            )
-            assert list(gates) == list(SHAPES)
-            for gate in gates.values():
-                assert gate.shape == (3, DIM)
-                assert gate.min() > 0
-                assert gate.max() < 1
-
-    def test_each_depends_on_every_stream(
-        self, fusion: GatedFusion, encoded: dict[str, Tensor]
-    ) -> None:
+    def test_each_depends_on_every_stream(self, fusion, encoded):
         before = fusion.gates(fusion.vectors(encoded))
         for name, tokens in encoded.items():
             after = fusion.gates(fusion.vectors(encoded | {name: torch.randn_like(tokens)}))
             assert all((after[gate] - before[gate]).abs().max() > 1e-3 for gate in SHAPES)
 
-    def test_a_closed_gate_shuts_its_stream_out(
-        self, fusion: GatedFusion, encoded: dict[str, Tensor]
-    ) -> None:
+    def test_a_closed_gate_shuts_its_stream_out(self, fusion, encoded):
         torch.nn.init.zeros_(fusion.gate.weight)
         with torch.no_grad():
             fusion.gate.bias[DIM : 2 * DIM] = -200.0
@@ -163,9 +117,7 @@ class TestGates:
         assert torch.equal(silent, context)
         assert (heard - context).abs().max() > 1e-2
 
-    def test_the_unit_is_that_of_the_paper(
-        self, fusion: GatedFusion, encoded: dict[str, Tensor]
-    ) -> None:
+    def test_the_unit_is_that_of_the_paper(self, fusion, encoded):
         seen = []
         fusion.read_out.register_forward_pre_hook(lambda _, args: seen.append(args[0]))
         fusion(encoded)
@@ -174,7 +126,7 @@ class TestGates:
         torch.testing.assert_close(seen[0], expected)
 
 
-def test_what_is_felt_asks_what_is_seen() -> None:
+def test_what_is_felt_asks_what_is_seen():
     """Each of the context's tokens depends on every slot, and on what sensor and state said."""
     fusion = CrossAttentionFusion(SHAPES, DIM, HEADS)
     encoded = {name: torch.randn(1, *shape) for name, shape in SHAPES.items()}
@@ -184,7 +136,7 @@ def test_what_is_felt_asks_what_is_seen() -> None:
         assert (changed - context).abs().amax(dim=-1).min() > 1e-4, name
 
 
-def test_without_fusion_a_token_stays_itself_and_knows_its_stream() -> None:
+def test_without_fusion_a_token_stays_itself_and_knows_its_stream():
     fusion = NoFusion({"sensor": (1, 6), "state": (1, 6)}, DIM)
     one = torch.randn(1, 1, 6)
     context = fusion({"sensor": one, "state": one})

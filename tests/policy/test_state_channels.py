@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from pipeline.policy.shape import channel_kinds, expanded_names
-from pipeline.policy.state_channels import expand, typical_state
+from pipeline.policy.robot_state import expand
+from pipeline.policy.shape import channel_kinds, expanded_names, typical_state
 
 NAMES = (*(f"joint_{n}" for n in range(1, 7)), *(f"pose_{axis}" for axis in "xyzabr"))
 UNITS = ("deg",) * 6 + ("mm",) * 3 + ("deg",) * 3
@@ -24,14 +24,14 @@ def states(seed: int = 0) -> Tensor:
     return begin + 5 * torch.rand(2, 9, 12, generator=generator)
 
 
-def test_the_arms_pose_angles_are_a_rotation_and_others_angles() -> None:
+def test_the_arms_pose_angles_are_a_rotation_and_others_angles():
     assert KINDS == ("deg",) * 6 + ("plain",) * 3 + ("rotation",) * 3
     assert channel_kinds(["pose_a", "pose_b", "q"], ["deg", "deg", "rad"]) == ("deg", "deg", "rad")
     assert channel_kinds(["q"], [""]) == ("plain",)
 
 
 @given(turned=st.lists(st.integers(-2, 2), min_size=12, max_size=12), reading=st.integers(0, 8))
-def test_an_angle_written_a_turn_further_changes_nothing(turned: list[int], reading: int) -> None:
+def test_an_angle_written_a_turn_further_changes_nothing(turned, reading):
     values, other = states(), states()
     turns = torch.tensor(
         [360.0 * n if unit == "deg" else 0 for n, unit in zip(turned, UNITS, strict=True)]
@@ -40,7 +40,7 @@ def test_an_angle_written_a_turn_further_changes_nothing(turned: list[int], read
     torch.testing.assert_close(expand(other, KINDS), expand(values, KINDS), atol=2e-5, rtol=0)
 
 
-def test_a_rotation_is_relative_to_the_newest_reading() -> None:
+def test_a_rotation_is_relative_to_the_newest_reading():
     values = states()
     six = expand(values, KINDS)[..., -6:].double()
     turns = Rotation.from_euler("XYZ", values[0, :, 9:].numpy(), degrees=True)
@@ -50,16 +50,16 @@ def test_a_rotation_is_relative_to_the_newest_reading() -> None:
 
 
 @pytest.mark.parametrize("kinds", [KINDS, ("plain",) * 12, ("rad", "deg") * 6])
-def test_every_channel_has_a_name(kinds: tuple) -> None:
+def test_every_channel_has_a_name(kinds):
     assert len(expanded_names(NAMES, kinds)) == expand(states(), kinds).shape[-1]
 
 
-def test_a_typical_state_expands_to_the_mean() -> None:
+def test_a_typical_state_expands_to_the_mean():
     mean = expand(states()[:1, -1:], KINDS)[0, 0]
     back = torch.tensor([[typical_state(mean.tolist(), KINDS)]])
     torch.testing.assert_close(expand(back, KINDS)[0, 0], mean, atol=1e-5, rtol=0)
 
 
-def test_radians_are_angles_too() -> None:
+def test_radians_are_angles_too():
     values = torch.tensor([[[math.pi / 6]]])
     assert expand(values, ("rad",))[0, 0].tolist() == pytest.approx([0.5, math.sqrt(0.75)])

@@ -48,7 +48,7 @@ def train(expert: ActionExpert, mixture: Any, steps: int = 350, batch: int = 256
 
 
 @pytest.fixture(scope="module")
-def trained(two_modes: Any) -> dict[str, ActionExpert]:
+def trained(two_modes):
     experts = {}
     for name, (kind, arguments) in EXPERTS.items():
         torch.manual_seed(0)
@@ -66,9 +66,7 @@ def drawn(expert: ActionExpert, which: int, count: int = 2000) -> Tensor:
 
 
 @pytest.mark.parametrize("name", ["epsilon", "flow"])
-def test_samples_have_the_modes_weights_and_spreads(
-    name: str, trained: dict[str, ActionExpert], two_modes: Any
-) -> None:
+def test_samples_have_the_modes_weights_and_spreads(name, trained, two_modes):
     weights, means, spreads, near = two_modes.judge(drawn(trained[name], OPEN))
     torch.testing.assert_close(weights, two_modes.weights, rtol=0, atol=0.07)
     torch.testing.assert_close(means, two_modes.means, rtol=0, atol=0.1)
@@ -82,9 +80,7 @@ def test_samples_have_the_modes_weights_and_spreads(
         assert ((samples[close].std(0) - two_modes.spread).abs() < 0.35 * two_modes.spread).all()
 
 
-def test_regression_lands_between_the_modes(
-    trained: dict[str, ActionExpert], two_modes: Any
-) -> None:
+def test_regression_lands_between_the_modes(trained, two_modes):
     """At the minimum of the expected smooth-L1, channel by channel, where nobody ever is."""
     samples = two_modes.draw(20_000, torch.Generator().manual_seed(3))[:, 0]
     grid = torch.linspace(-1.5, 1.5, 301)

@@ -1,6 +1,5 @@
 """A small store and a policy of a few thousand parameters that trains in a second."""
 
-from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -16,8 +15,6 @@ from pipeline.train.batches import BatchIndices
 from pipeline.train.loop import Trainer
 from pipeline.train.run import open_run
 from pipeline.train.split import split_by_episode
-
-Make = Callable[..., Any]
 
 KINDS = ("plain", "bfloat16", "variants", "no sensor", "no state")
 SMALL: dict[str, Any] = {
@@ -42,12 +39,12 @@ SMALL: dict[str, Any] = {
 
 
 @pytest.fixture(scope="session")
-def store(tiny_store: Make, tmp_path_factory: pytest.TempPathFactory) -> FeatureStore:
+def store(tiny_store, tmp_path_factory):
     return FeatureStore.open(tiny_store(tmp_path_factory.mktemp("training")))
 
 
 @pytest.fixture(scope="session")
-def params_below() -> Make:
+def params_below():
     """`params_below(folder, key=value, ...)`: small params that work below this folder."""
 
     def make(folder: Path, **changed: Any) -> TrainHeadParams:
@@ -58,13 +55,13 @@ def params_below() -> Make:
 
 
 @pytest.fixture
-def params(params_below: Make, tmp_path: Path) -> Make:
+def params(params_below, tmp_path):
     """`params(key=value, ...)`: small params that work below the test's folder."""
     return partial(params_below, tmp_path)
 
 
 @pytest.fixture(scope="session")
-def trainer() -> Callable[[FeatureStore, TrainHeadParams], Trainer]:
+def trainer():
     """A trainer that begins anew or goes on with what lies at the params' output."""
 
     def make(store: FeatureStore, params: TrainHeadParams) -> Trainer:
@@ -79,7 +76,7 @@ class Stop(Exception):
 
 
 @pytest.fixture
-def stop_at(monkeypatch: pytest.MonkeyPatch) -> Callable[[Trainer, int | None], None]:
+def stop_at(monkeypatch):
     """`stop_at(trainer, step)`: train until this step has begun, and end as a kill does.
 
     Where `step` is None, the kill comes before the finished run is renamed.
@@ -106,9 +103,7 @@ def stop_at(monkeypatch: pytest.MonkeyPatch) -> Callable[[Trainer, int | None], 
 
 
 @pytest.fixture(scope="session", params=KINDS)
-def any_store(
-    request: pytest.FixtureRequest, tiny_store: Make, tmp_path_factory: pytest.TempPathFactory
-) -> FeatureStore:
+def any_store(request, tiny_store, tmp_path_factory):
     """Small stores that differ in what they hold, some rows of two variants among them."""
     folder, kind = tmp_path_factory.mktemp("kinds"), request.param
     changed = {
@@ -127,7 +122,7 @@ def any_store(
 
 
 @pytest.fixture(scope="session")
-def draw_plan() -> Callable[..., list[BatchIndices]]:
+def draw_plan():
     """`draw_plan(store, batches, size=7)`: random ticks of random variants."""
 
     def make(store: FeatureStore, batches: int, size: int = 7) -> list[BatchIndices]:
@@ -141,7 +136,7 @@ def draw_plan() -> Callable[..., list[BatchIndices]]:
 
 
 @pytest.fixture(scope="session")
-def same_bits() -> Callable[[Batch, Batch], bool]:
+def same_bits():
     """Whether two batches are equal to the bit, in shape and in dtype."""
 
     def compare(one: Batch, other: Batch) -> bool:

@@ -1,16 +1,13 @@
 """What lives on a device is gathered there to the same bits as from the map; what does is said."""
 
-from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
 from pipeline.store import FeatureStore
-from pipeline.store.gather import WIDE, Batch
+from pipeline.store.gather import WIDE
 from pipeline.train.batches import (
     BatchIndices,
     DeviceStore,
@@ -25,14 +22,9 @@ from pipeline.train.loop import Trainer
 CPU, CUDA = torch.device("cpu"), torch.device("cuda")
 ALL = frozenset({"features", "sensor", "state", "action"})
 FIELDS = [{*WIDE}, {"sensor"}, {"features", "action"}, {"state"}]
-Make = Callable[..., Any]
-Plan = Callable[..., list[BatchIndices]]
-Same = Callable[[Batch, Batch], bool]
 
 
-def test_batches_are_those_of_the_map(
-    any_store: FeatureStore, draw_plan: Plan, same_bits: Same
-) -> None:
+def test_batches_are_those_of_the_map(any_store, draw_plan, same_bits):
     wanted = [*draw_plan(any_store, 6), *cut_batches(np.arange(any_store.ticks), 32)]
     for fields in FIELDS:
         resident = DeviceStore(any_store, fields, CPU)
@@ -49,7 +41,7 @@ def test_batches_are_those_of_the_map(
                     assert batch.sizes == expected.sizes
 
 
-def test_it_is_a_copy(tiny_store: Callable[..., Path], tmp_path: Path) -> None:
+def test_it_is_a_copy(tiny_store, tmp_path):
     store = FeatureStore.open(tiny_store(tmp_path))
     before = store.gather([40]).features.clone()
     resident = DeviceStore(store, {"features"}, CPU)
@@ -62,9 +54,7 @@ def test_it_is_a_copy(tiny_store: Callable[..., Path], tmp_path: Path) -> None:
 
 @pytest.mark.gpu
 @pytest.mark.parametrize("fields", FIELDS, ids=lambda fields: "+".join(sorted(fields)))
-def test_on_a_gpu(
-    any_store: FeatureStore, draw_plan: Plan, same_bits: Same, fields: set[str]
-) -> None:
+def test_on_a_gpu(any_store, draw_plan, same_bits, fields):
     device, windows = torch.device("cuda"), Windows(4, 40, 5)
     wanted = [*draw_plan(any_store, 6), *cut_batches(np.arange(any_store.ticks), 32)]
     resident = DeviceStore(any_store, fields, device)
@@ -76,7 +66,7 @@ def test_on_a_gpu(
         assert same_bits(batch, expected)
 
 
-def test_auto_takes_a_gpu_that_has_room_for_all(store: FeatureStore) -> None:
+def test_auto_takes_a_gpu_that_has_room_for_all(store):
     fields, line = choose_feed("auto", store, CUDA, free=2**30)
     assert fields == ALL
     assert line.startswith("feed: device (auto; ") and "free on cuda" in line
@@ -86,9 +76,7 @@ def test_auto_takes_a_gpu_that_has_room_for_all(store: FeatureStore) -> None:
     assert line.startswith("feed: mapped (auto: ")
 
 
-def test_device_takes_what_fits_the_smallest_first(
-    store: FeatureStore, tiny_store: Callable[..., Path], tmp_path: Path
-) -> None:
+def test_device_takes_what_fits_the_smallest_first(store, tiny_store, tmp_path):
     sizes = {name: store.gatherer.tensor(name).nbytes for name in ALL}
     largest = max(sizes, key=lambda name: sizes[name])
     free = int((sum(sizes.values()) - 1) / 0.6)
@@ -99,9 +87,7 @@ def test_device_takes_what_fits_the_smallest_first(
     assert choose_feed("device", lacking, CPU)[0] == ALL - {"sensor"}, "it needs no room"
 
 
-def test_a_run_with_another_feed_continues_bit_for_bit(
-    store: FeatureStore, params: Make, trainer: Make, tmp_path: Path, stop_at: Make
-) -> None:
+def test_a_run_with_another_feed_continues_bit_for_bit(store, params, trainer, tmp_path, stop_at):
     whole = trainer(store, params(feed="mapped", output=tmp_path / "whole"))
     whole.fit()
     stop_at(trainer(store, params(feed="mapped")), 11)
@@ -115,9 +101,3 @@ def test_a_run_with_another_feed_continues_bit_for_bit(
 def weights(trainer: Trainer) -> dict[str, torch.Tensor]:
     averaged = {f"average {name}": value for name, value in trainer.average.weights.items()}
     return {**trainer.learning, **averaged}
-
-
-def test_the_summary_says_which_and_why(store: FeatureStore, params: Make, trainer: Make) -> None:
-    assert "feed: mapped (auto: training runs on the cpu)" in trainer(store, params()).summary()
-    lines = trainer(store, params(feed="device")).summary()
-    assert any(line.startswith("feed: device (as train_head.feed says;") for line in lines)

@@ -7,7 +7,6 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable
-from multiprocessing.context import ForkServerContext
 from pathlib import Path
 from typing import Any
 
@@ -152,7 +151,7 @@ def ranked(rank: int, port: int, said: Path, script: Path, *arguments: object) -
 
 
 @pytest.fixture
-def two_ranks(fork_server: ForkServerContext, tmp_path: Path) -> Make:
+def two_ranks(fork_server, tmp_path):
     """`two_ranks(script, ...)`: what the two processes have said, which must end well.
 
     Forked, and without torchrun, which imports for seconds and adds nothing to what they say to
@@ -177,14 +176,14 @@ def two_ranks(fork_server: ForkServerContext, tmp_path: Path) -> Make:
 
 
 @pytest.fixture
-def script(tmp_path: Path) -> Path:
+def script(tmp_path):
     path = tmp_path / "train.py"
     path.write_text(TRAIN)
     return path
 
 
 @pytest.fixture
-def write(store: FeatureStore, params: Make, tmp_path: Path) -> Make:
+def write(store, params, tmp_path):
     """`write(name, key=value, ...)`: a params.yaml of small params."""
 
     def make(name: str, **changed: Any) -> Path:
@@ -232,14 +231,8 @@ def same(one: Path, other: Path) -> bool:
 
 @pytest.mark.extra
 def test_two_processes_follow_the_curve_of_one_that_accumulates(
-    store: FeatureStore,
-    trainer: Make,
-    write: Make,
-    script: Path,
-    two_ranks: Make,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+    store, trainer, write, script, two_ranks, tmp_path, monkeypatch
+):
     """With dropout, uneven parts and accumulation on each; both stop early at the same step."""
     pytest.importorskip("tensorboard", reason="tensorboard is not installed")
     chosen = {
@@ -268,8 +261,8 @@ def test_two_processes_follow_the_curve_of_one_that_accumulates(
 
 
 def test_a_signal_to_torchrun_stops_all_after_one_step_and_one_process_can_go_on(
-    store: FeatureStore, trainer: Make, write: Make, script: Path, tmp_path: Path
-) -> None:
+    store, trainer, write, script, tmp_path
+):
     written = write("together", model_type="diffusion", checkpoint_every=1000, max_steps=12)
     process = torchrun(script, json.dumps(case(written, holds=6)))
     assert process.stdout is not None
@@ -290,9 +283,7 @@ def test_a_signal_to_torchrun_stops_all_after_one_step_and_one_process_can_go_on
     assert same(tmp_path / "together/last", tmp_path / "alone/last")
 
 
-def test_what_goes_wrong_is_said_once_and_nobody_waits(
-    write: Make, script: Path, two_ranks: Make, tmp_path: Path
-) -> None:
+def test_what_goes_wrong_is_said_once_and_nobody_waits(write, script, two_ranks, tmp_path):
     """One case after the other between the same two processes, which must all end each."""
     cases = [
         (case(write("diverging", lr=1e3, weight_decay=1e3)), "error: step"),
@@ -318,7 +309,7 @@ def test_what_goes_wrong_is_said_once_and_nobody_waits(
 
 
 @pytest.mark.slow
-def test_a_process_that_fails_alone_ends_torchrun(write: Make, script: Path) -> None:
+def test_a_process_that_fails_alone_ends_torchrun(write, script):
     process = torchrun(script, json.dumps(case(write("together"), fails="step 1")))
     _, err = process.communicate()
     assert process.returncode == 1
@@ -328,7 +319,7 @@ def test_a_process_that_fails_alone_ends_torchrun(write: Make, script: Path) -> 
     assert "Connection closed" not in err
 
 
-def test_what_processes_tell_each_other(two_ranks: Make, tmp_path: Path) -> None:
+def test_what_processes_tell_each_other(two_ranks, tmp_path):
     script = tmp_path / "primitives.py"
     script.write_text(PRIMITIVES)
     said = two_ranks(script)
@@ -336,7 +327,7 @@ def test_what_processes_tell_each_other(two_ranks: Make, tmp_path: Path) -> None
     assert "done 1" in said
 
 
-def test_a_process_alone_is_a_group_of_one() -> None:
+def test_a_process_alone_is_a_group_of_one():
     processes = ProcessGroup.current()
     assert (processes.rank, processes.size, processes.first) == (0, 1, True)
     with pytest.raises(ConfigError), process_group("cpu") as group:
@@ -344,14 +335,14 @@ def test_a_process_alone_is_a_group_of_one() -> None:
         raise ConfigError("as it is")
 
 
-def test_an_incomplete_environment_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_incomplete_environment_is_named(monkeypatch):
     monkeypatch.setenv("WORLD_SIZE", "2")
     monkeypatch.setenv("RANK", "0")
     with pytest.raises(ConfigError, match="LOCAL_RANK, MASTER_ADDR, MASTER_PORT is missing"):
         process_group("cpu").__enter__()
 
 
-def test_every_process_has_a_gpu_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_every_process_has_a_gpu_of_its_own(monkeypatch):
     monkeypatch.setenv("WORLD_SIZE", "2")
     monkeypatch.setenv("LOCAL_RANK", "1")
     with pytest.raises(ConfigError, match=r"cuda:0: expected auto, cpu or cuda for 2 processes"):

@@ -1,20 +1,15 @@
 """A run ends when it has stopped getting better, wherever it is stopped on the way."""
 
 import csv
-from collections.abc import Callable
-from typing import Any
 
 import pytest
 
 from pipeline.base.errors import ConfigError
 from pipeline.policy.checkpoint import load_policy
-from pipeline.store import FeatureStore
 from pipeline.train.loop import EarlyStopping, Trainer
 
-Make = Callable[..., Any]
 
-
-def test_it_counts_since_the_best() -> None:
+def test_it_counts_since_the_best():
     stopping = EarlyStopping(patience=2)
     assert [stopping.take(error) for error in (3.0, 2.0, 2.0, 1.0)] == [True, True, False, True]
     assert (stopping.best_error, stopping.stalled, stopping.exhausted) == (1.0, 0, False)
@@ -25,9 +20,7 @@ def test_it_counts_since_the_best() -> None:
     assert not EarlyStopping(None, 1.0, stalled=10**6).exhausted
 
 
-def test_stopping_early_needs_something_held_out(
-    store: FeatureStore, params: Make, trainer: Make
-) -> None:
+def test_stopping_early_needs_something_held_out(store, params, trainer):
     with pytest.raises(ConfigError, match="early_stopping is 3, but nothing is held out") as caught:
         trainer(store, params(early_stopping=3, split={"val": 0}))
     assert "train_head.split.val is 0. Set it above 0" in str(caught.value)
@@ -35,7 +28,7 @@ def test_stopping_early_needs_something_held_out(
 
 
 @pytest.fixture
-def errors(monkeypatch: pytest.MonkeyPatch) -> dict[int, float]:
+def errors(monkeypatch):
     """What evaluations find, by step; the best is at step 4."""
     found = {2: 0.9, 4: 0.5, 6: 0.8, 8: 0.6, 10: 0.7, 12: 0.1}
     monkeypatch.setattr(
@@ -50,14 +43,8 @@ def errors(monkeypatch: pytest.MonkeyPatch) -> dict[int, float]:
 
 @pytest.mark.parametrize("stopped", [7, None])
 def test_it_stops_early_also_when_it_was_interrupted(
-    store: FeatureStore,
-    params: Make,
-    trainer: Make,
-    errors: dict[int, float],
-    stop_at: Make,
-    capsys: pytest.CaptureFixture[str],
-    stopped: int | None,
-) -> None:
+    store, params, trainer, errors, stop_at, capsys, stopped
+):
     chosen = params(early_stopping=3, eval_every=2, checkpoint_every=1, max_steps=100)
     stop_at(trainer(store, chosen), stopped)
     done = trainer(store, chosen)

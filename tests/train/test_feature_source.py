@@ -1,6 +1,6 @@
 """What a front brings is trained, averaged, kept and saved; what it holds frozen is not copied."""
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -13,13 +13,10 @@ from pipeline.base.files import read_document
 from pipeline.policy.checkpoint import load_policy
 from pipeline.policy.policy import Policy, Trainable
 from pipeline.store import FeatureStore
-from pipeline.train.batches import BatchIndices, Prefetch, Windows
-from pipeline.train.feature_source import FeatureSource
+from pipeline.train.batches import BatchIndices, FeatureSource, Prefetch, Windows
 from pipeline.train.loop import Trainer
 from pipeline.train.run import open_run
 from pipeline.train.split import split_by_episode
-
-Make = Callable[..., Any]
 
 
 class Adapted(Trainable):
@@ -88,7 +85,7 @@ def make(store: FeatureStore, params: TrainHeadParams) -> Trainer:
     return Trainer(store, params, split, open_run(params, store, front.identity), front)
 
 
-def test_what_a_front_brings_is_trained_judged_and_saved(store: FeatureStore, params: Make) -> None:
+def test_what_a_front_brings_is_trained_judged_and_saved(store, params):
     done = make(store, params(max_steps=8, sensor_lr=5e-3))
     module = done.module
     assert isinstance(module, Adapted)
@@ -124,9 +121,7 @@ def test_what_a_front_brings_is_trained_judged_and_saved(store: FeatureStore, pa
     assert any("learns" in line and "of" in line for line in done.summary())
 
 
-def test_a_run_with_a_front_goes_on_to_the_bit(
-    store: FeatureStore, params: Make, tmp_path: Path, stop_at: Make
-) -> None:
+def test_a_run_with_a_front_goes_on_to_the_bit(store, params, tmp_path, stop_at):
     steps = {"max_steps": 8, "checkpoint_every": 5}
     whole = make(store, params(**steps, output=tmp_path / "whole", logs=tmp_path / "whole_logs"))
     whole.fit()

@@ -10,7 +10,7 @@ from pipeline.train.process_group import deferred_interrupt
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_the_first_signal_is_noted_and_the_second_stops_at_once(number: signal.Signals) -> None:
+def test_the_first_signal_is_noted_and_the_second_stops_at_once(number):
     before = signal.getsignal(number)
     with pytest.raises(KeyboardInterrupt), deferred_interrupt() as interrupted:
         assert not interrupted()
@@ -21,7 +21,7 @@ def test_the_first_signal_is_noted_and_the_second_stops_at_once(number: signal.S
     assert signal.getsignal(number) is before
 
 
-def test_outside_the_main_thread_nothing_changes() -> None:
+def test_outside_the_main_thread_nothing_changes():
     seen: list[object] = []
 
     def work() -> None:

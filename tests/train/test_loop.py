@@ -6,7 +6,6 @@ import os
 import re
 import signal
 import subprocess
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -26,9 +25,6 @@ from pipeline.train.predictions import predict
 from pipeline.train.run import TRAINER_VERSION
 from pipeline.train.scores import action_space, compare
 
-Patch = pytest.MonkeyPatch
-
-Make = Callable[..., Any]
 GOLDEN = Path(__file__).with_name("golden_run.json")
 
 
@@ -47,9 +43,7 @@ def same_weights(one: Trainer, other: Trainer) -> bool:
 
 
 @pytest.fixture(scope="module")
-def undisturbed(
-    store: FeatureStore, params_below: Make, trainer: Make, tmp_path_factory: pytest.TempPathFactory
-) -> Trainer:
+def undisturbed(store, params_below, trainer, tmp_path_factory):
     """Twenty steps, finished; nothing of it is changed by a test."""
     done = trainer(store, params_below(tmp_path_factory.mktemp("whole")))
     done.fit()
@@ -57,14 +51,7 @@ def undisturbed(
 
 
 @pytest.mark.parametrize("stopped", [1, 13, None])
-def test_killed_at_any_step_it_ends_the_same(
-    store: FeatureStore,
-    params: Make,
-    trainer: Make,
-    undisturbed: Trainer,
-    stop_at: Make,
-    stopped: int | None,
-) -> None:
+def test_killed_at_any_step_it_ends_the_same(store, params, trainer, undisturbed, stop_at, stopped):
     stop_at(trainer(store, params()), stopped)
     # What decides no number may change between the two starts.
     resumed = trainer(store, params(checkpoint_every=7))
@@ -80,9 +67,7 @@ def test_killed_at_any_step_it_ends_the_same(
     assert (logs / "metrics.json").read_text() == (whole / "metrics.json").read_text()
 
 
-def test_a_signal_ends_the_step_and_saves_once(
-    store: FeatureStore, params: Make, trainer: Make, undisturbed: Trainer, monkeypatch: Patch
-) -> None:
+def test_a_signal_ends_the_step_and_saves_once(store, params, trainer, undisturbed, monkeypatch):
     real, save = Trainer._train_step, Trainer._save_last
     saved: list[int] = []
 
@@ -110,7 +95,7 @@ def test_a_signal_ends_the_step_and_saves_once(
     assert same_weights(resumed, undisturbed)
 
 
-def test_what_a_finished_run_leaves(undisturbed: Trainer, store: FeatureStore) -> None:
+def test_what_a_finished_run_leaves(undisturbed, store):
     output, logs = undisturbed.run.output, undisturbed.params.logs
     assert sorted(os.listdir(output)) == ["best", "last", "run.json"]
     assert sorted(os.listdir(output / "last")) == ["policy.json", "policy.safetensors"]
@@ -142,16 +127,14 @@ def test_what_a_finished_run_leaves(undisturbed: Trainer, store: FeatureStore) -
     assert {"error", "translation_mm", "rotation_deg", "gripper"} == set(metrics["val"])
 
 
-def test_it_learns_what_the_store_says(store: FeatureStore, params: Make, trainer: Make) -> None:
+def test_it_learns_what_the_store_says(store, params, trainer):
     steps = {"max_steps": 50, "eval_every": 50, "checkpoint_every": 50}
     done = trainer(store, params(horizon=1, batch_size=24, lr=2e-2, **steps))
     done.fit()
     assert np.mean(losses(done)[-10:]) < 0.65 * np.mean(losses(done)[:10])
 
 
-def test_without_held_out_episodes_the_best_is_the_newest(
-    store: FeatureStore, params: Make, trainer: Make
-) -> None:
+def test_without_held_out_episodes_the_best_is_the_newest(store, params, trainer):
     done = trainer(store, params(split={"val": 0, "test": 0}, max_steps=4, eval_every=2))
     done.fit()
     best = load_policy(done.run.output / "best")
@@ -160,9 +143,7 @@ def test_without_held_out_episodes_the_best_is_the_newest(
     assert not best.split["test"]
 
 
-def test_nothing_in_training_looks_at_test(
-    tiny_store: Make, params: Make, trainer: Make, tmp_path: Path
-) -> None:
+def test_nothing_in_training_looks_at_test(tiny_store, params, trainer, tmp_path):
     """Other features, actions and readings in the test episodes change no bit of what is kept."""
     kept: list[dict[str, Any]] = []
     for name in ("plain", "spoilt"):
@@ -190,7 +171,7 @@ def test_nothing_in_training_looks_at_test(
         assert all(torch.equal(spoilt.weights[name], plain.weights[name]) for name in plain.weights)
 
 
-def test_any_stream_may_be_left_out(store: FeatureStore, params: Make, trainer: Make) -> None:
+def test_any_stream_may_be_left_out(store, params, trainer):
     for disabled in ("features_enabled", "sensor_enabled", "robot_state_enabled"):
         done = trainer(store, params(max_steps=1, seed=len(disabled), **{disabled: False}))
         assert any(f"disabled by train_head.{disabled}" in line for line in done.summary())
@@ -198,9 +179,7 @@ def test_any_stream_may_be_left_out(store: FeatureStore, params: Make, trainer: 
         assert len(losses(done)) == 1
 
 
-def test_a_loss_that_is_not_finite_names_step_and_ticks(
-    store: FeatureStore, params: Make, trainer: Make, monkeypatch: Patch
-) -> None:
+def test_a_loss_that_is_not_finite_names_step_and_ticks(store, params, trainer, monkeypatch):
     stopped = trainer(store, params())
     real = stopped.policy.loss
 
@@ -216,9 +195,7 @@ def test_a_loss_that_is_not_finite_names_step_and_ticks(
     assert read_trainer(stopped.run.last)[0].step == 5
 
 
-def test_logs_need_no_repository_and_change_none(
-    store: FeatureStore, params: Make, trainer: Make, tmp_path: Path, monkeypatch: Patch
-) -> None:
+def test_logs_need_no_repository_and_change_none(store, params, trainer, tmp_path, monkeypatch):
     """A repository without a commit, which dvclive itself cannot bear."""
     subprocess.run(["git", "init", "-q", str(tmp_path)], check=True)
     (tmp_path / ".dvc").mkdir()
@@ -229,7 +206,7 @@ def test_logs_need_no_repository_and_change_none(
     assert json.loads((tmp_path / "logs/metrics.json").read_text())["step"] == 1
 
 
-def test_the_golden_run(undisturbed: Trainer) -> None:
+def test_the_golden_run(undisturbed):
     """Twenty steps with the losses they have always had.
 
     A refactor changes no bit on a kind of machine that is in the file; elsewhere float32 sums are
@@ -254,7 +231,7 @@ def test_the_golden_run(undisturbed: Trainer) -> None:
         assert found == pytest.approx(kept, rel=1e-4), changed
 
 
-def test_autocast_trains_in_bfloat16(store: FeatureStore, params: Make, trainer: Make) -> None:
+def test_autocast_trains_in_bfloat16(store, params, trainer):
     done = trainer(store, params(amp="bfloat16", max_steps=4))
     assert any("bfloat16 autocast" in line for line in done.summary())
     done.fit()
@@ -265,9 +242,7 @@ def test_autocast_trains_in_bfloat16(store: FeatureStore, params: Make, trainer:
     assert all(value.dtype == torch.float32 for value in done.policy.state_dict().values())
 
 
-def test_logs_stay_known_where_no_speed_lies_beside_them(
-    store: FeatureStore, params: Make, trainer: Make
-) -> None:
+def test_logs_stay_known_where_no_speed_lies_beside_them(store, params, trainer):
     """As DVC restores them in another checkout."""
     short = {"max_steps": 1, "loggers": []}
     trainer(store, params(**short)).fit()
@@ -276,9 +251,7 @@ def test_logs_stay_known_where_no_speed_lies_beside_them(
     assert (params().logs / "metrics.json").exists()
 
 
-def test_logs_never_write_through_a_link(
-    store: FeatureStore, params: Make, trainer: Make, tmp_path: Path
-) -> None:
+def test_logs_never_write_through_a_link(store, params, trainer, tmp_path):
     """As DVC restores an output: every file a link into its cache."""
     short = {"max_steps": 3, "eval_every": 2}
     trainer(store, params(**short)).fit()
@@ -296,9 +269,7 @@ def test_logs_never_write_through_a_link(
 
 
 @pytest.mark.gpu
-def test_on_a_gpu_a_run_is_stopped_resumed_and_judged(
-    store: FeatureStore, params: Make, trainer: Make, stop_at: Make
-) -> None:
+def test_on_a_gpu_a_run_is_stopped_resumed_and_judged(store, params, trainer, stop_at):
     stop_at(trainer(store, params(device="cuda")), 12)
     resumed = trainer(store, params(device="cuda"))
     assert (resumed.run.status, resumed.step, resumed.device.type) == ("resumed", 10, "cuda")

@@ -32,7 +32,7 @@ class Toy(nn.Module):
         return self.norm(self.linear(x)).sum()
 
 
-def test_the_rate_warms_up_peaks_and_ends_at_its_floor() -> None:
+def test_the_rate_warms_up_peaks_and_ends_at_its_floor():
     params = TrainHeadParams(warmup_steps=10, max_steps=111, min_lr_fraction=0.1)
     rates = [schedule(step, params) for step in range(111)]
     assert rates[:10] == pytest.approx([0.1 * step for step in range(1, 11)])
@@ -42,7 +42,7 @@ def test_the_rate_warms_up_peaks_and_ends_at_its_floor() -> None:
     assert all(a >= b for a, b in pairwise(rates[10:]))
 
 
-def test_a_trapezoid_stays_and_then_falls_in_a_line() -> None:
+def test_a_trapezoid_stays_and_then_falls_in_a_line():
     params = TrainHeadParams(
         lr_schedule="trapezoid",
         warmup_steps=10,
@@ -59,7 +59,7 @@ def test_a_trapezoid_stays_and_then_falls_in_a_line() -> None:
     assert falls == pytest.approx([0.9 / 20] * 20)
 
 
-def test_a_constant_rate_only_warms_up() -> None:
+def test_a_constant_rate_only_warms_up():
     params = TrainHeadParams(lr_schedule="constant", warmup_steps=4, max_steps=50)
     rates = [schedule(step, params) for step in range(50)]
     assert rates[:4] == [0.25, 0.5, 0.75, 1.0]
@@ -67,7 +67,7 @@ def test_a_constant_rate_only_warms_up() -> None:
 
 
 @pytest.mark.parametrize("kind", ["cosine", "trapezoid", "constant"])
-def test_every_schedule_is_sane_at_the_extremes(kind: str) -> None:
+def test_every_schedule_is_sane_at_the_extremes(kind):
     edges = ((0, 1), (0, 2), (5, 5), (100, 3), (1, 2), (3, 40))
     for decay, (warmup, steps) in product((0.0, 0.5, 1.0), edges):
         params = TrainHeadParams.model_validate(
@@ -84,7 +84,7 @@ def test_every_schedule_is_sane_at_the_extremes(kind: str) -> None:
         assert max(rates) == 1.0
 
 
-def test_every_group_has_its_own_peak_and_decay() -> None:
+def test_every_group_has_its_own_peak_and_decay():
     params = TrainHeadParams(lr=1e-3, weight_decay=0.1)
     toy = Toy()
     toy.embedding.requires_grad_(False)
@@ -106,7 +106,7 @@ def test_every_group_has_its_own_peak_and_decay() -> None:
     }
 
 
-def test_only_matrices_and_kernels_decay() -> None:
+def test_only_matrices_and_kernels_decay():
     decayed, kept = decay_groups(Toy())
     assert decayed == ["linear.weight", "conv.weight"]
     assert set(kept) == {
@@ -119,7 +119,7 @@ def test_only_matrices_and_kernels_decay() -> None:
     }
 
 
-def test_the_optimizer_goes_on_where_it_was() -> None:
+def test_the_optimizer_goes_on_where_it_was():
     params = TrainHeadParams(lr=0.1)
 
     def steps(toy: nn.Module, optimizer: torch.optim.Optimizer, count: int) -> None:
@@ -142,7 +142,7 @@ def test_the_optimizer_goes_on_where_it_was() -> None:
         assert torch.equal(stopped.state_dict()[name], value), name
 
 
-def test_the_average_follows_its_formula() -> None:
+def test_the_average_follows_its_formula():
     policy = nn.Linear(1, 1, bias=False)
     nn.init.constant_(policy.weight, 0.0)
     average = WeightAverage(policy, decay=0.5)
@@ -157,7 +157,7 @@ def test_the_average_follows_its_formula() -> None:
     assert not average.module.weight.requires_grad
 
 
-def test_what_does_not_learn_is_shared_and_left_alone() -> None:
+def test_what_does_not_learn_is_shared_and_left_alone():
     toy = Toy()
     toy.linear.requires_grad_(False)
     toy.register_buffer("statistics", torch.ones(3))
@@ -174,15 +174,7 @@ def test_what_does_not_learn_is_shared_and_left_alone() -> None:
     assert not average.module.conv.weight.requires_grad
 
 
-def test_without_decay_the_average_is_the_policy() -> None:
-    policy = nn.Linear(2, 2)
-    average = WeightAverage(policy, decay=0.0)
-    nn.init.normal_(policy.weight)
-    average.update(1)
-    assert torch.equal(average.module.weight, policy.weight)
-
-
-def test_history_settles_late_and_names_the_first_bad_step() -> None:
+def test_history_settles_late_and_names_the_first_bad_step():
     history = History()
     for step in range(5):
         loss = torch.tensor(float("nan") if step >= 3 else float(step))

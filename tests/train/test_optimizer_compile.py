@@ -14,9 +14,7 @@ from typing import Any
 import pytest
 import torch
 
-from pipeline.base.config import TrainHeadParams
 from pipeline.base.errors import ConfigError
-from pipeline.store import FeatureStore
 from pipeline.train.optimizer import compiled
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -59,7 +57,7 @@ def said(code: str, *arguments: object, **environment: str) -> str:
 
 
 @pytest.mark.slow
-def test_without_a_compiler_it_says_what_is_missing() -> None:
+def test_without_a_compiler_it_says_what_is_missing():
     found = said(PROBE, CXX="/nowhere/g++")
     assert found.startswith("ConfigError train_head.compile: ")
     assert "InvalidCxxCompiler" in found
@@ -69,9 +67,7 @@ def test_without_a_compiler_it_says_what_is_missing() -> None:
 
 @pytest.mark.slow
 @pytest.mark.timeout(600)
-def test_compiled_a_training_has_the_numbers_it_has_without(
-    store: FeatureStore, params: Callable[..., TrainHeadParams], tmp_path: Path
-) -> None:
+def test_compiled_a_training_has_the_numbers_it_has_without(store, params, tmp_path):
     """Dropout, dropped streams, noise and flow times too; windows that no patch divides."""
     chosen = {
         "model_type": "flow_matching",
@@ -94,7 +90,7 @@ def test_compiled_a_training_has_the_numbers_it_has_without(
     assert not torch.allclose(curves["other noise"], curves["eager"], rtol=1e-2)
 
 
-def test_a_loss_that_does_not_compile_is_not_a_traceback(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_loss_that_does_not_compile_is_not_a_traceback(monkeypatch):
     from torch._dynamo.exc import BackendCompilerFailed
 
     def broken(function: Callable[..., Any], **chosen: object) -> Callable[..., Any]:

@@ -3,7 +3,6 @@
 import csv
 import sys
 import time
-from collections.abc import Callable
 from dataclasses import replace
 from io import StringIO
 from itertools import count
@@ -14,18 +13,14 @@ import numpy as np
 import pytest
 import torch
 
-from pipeline.base.config import SplitParams
 from pipeline.store import FeatureStore, episode_name
 from pipeline.train.batches import Prefetch, Windows
 from pipeline.train.log import speed_file
 from pipeline.train.progress import Progress, describe_data, peak_memory_bytes
 from pipeline.train.run import policy_shape
-from pipeline.train.split import Split, split_by_episode
+from pipeline.train.split import Split
 from pipeline.train.statistics import fit_normalization
 
-Said = pytest.CaptureFixture[str]
-
-Make = Callable[..., Any]
 CPU = torch.device("cpu")
 
 
@@ -47,14 +42,14 @@ class Terminal(StringIO):
 
 
 @pytest.fixture
-def clock(monkeypatch: pytest.MonkeyPatch) -> list[float]:
+def clock(monkeypatch):
     """The time in s, which a test moves."""
     now = [1000.0]
     monkeypatch.setattr("pipeline.train.progress.time.perf_counter", lambda: now[0])
     return now
 
 
-def test_without_a_terminal_a_line_a_minute(clock: list[float], capsys: Said) -> None:
+def test_without_a_terminal_a_line_a_minute(clock, capsys):
     with Progress(Waiting(), CPU, range(100, 200)) as progress:
         for _ in range(30):  # steps of 5 s, a reading every second one
             for _ in range(2):
@@ -69,34 +64,7 @@ def test_without_a_terminal_a_line_a_minute(clock: list[float], capsys: Said) ->
     ]
 
 
-def test_of_several_processes_one_speaks(clock: list[float], capsys: Said) -> None:
-    with Progress(Waiting(), CPU, range(2), shown=False) as progress:
-        clock[0] += 1e6
-        progress.advance()
-        progress.show(progress.read(), 1.0, 1e-3)
-    assert capsys.readouterr() == ("", "")
-
-
-def test_between_evaluations_a_training_says_its_step_and_loss(
-    store: FeatureStore, params: Make, trainer: Make, monkeypatch: pytest.MonkeyPatch, capsys: Said
-) -> None:
-    monkeypatch.setattr("pipeline.train.progress.EVERY_S", 0.0)
-    monkeypatch.setattr("pipeline.train.loop.LOG_EVERY", 1)
-    done = trainer(store, params(max_steps=3, eval_every=3))
-    done.fit()
-    lines = capsys.readouterr().err.splitlines()
-    assert [line.split(":")[0] for line in lines] == [f"step {n} of 3" for n in (1, 2, 3)]
-    losses = done.history.tensor()[:, done.history.columns.index("loss")].tolist()
-    assert all(f"train loss {loss:.4f}" in line for loss, line in zip(losses, lines, strict=True))
-
-
-def test_on_a_terminal_a_bar_with_the_loss(
-    store: FeatureStore,
-    params: Make,
-    trainer: Make,
-    clock: list[float],
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_on_a_terminal_a_bar_with_the_loss(store, params, trainer, clock, monkeypatch):
     terminal = Terminal()
     monkeypatch.setattr(sys, "stderr", terminal)
     monkeypatch.setattr("pipeline.train.progress.EVERY_S", 0.0)
@@ -107,7 +75,7 @@ def test_on_a_terminal_a_bar_with_the_loss(
     assert "train loss" not in shown
 
 
-def test_pauses_are_not_counted(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_pauses_are_not_counted(monkeypatch):
     now = [100.0]
     monkeypatch.setattr(time, "perf_counter", lambda: now[0])
     feed = Waiting()
@@ -127,14 +95,14 @@ def test_pauses_are_not_counted(monkeypatch: pytest.MonkeyPatch) -> None:
     assert progress.read()[:2] == (0.1, 0.0)
 
 
-def test_peak_memory_is_at_least_what_was_held() -> None:
+def test_peak_memory_is_at_least_what_was_held():
     held = torch.ones(64 * 2**20 // 4)
     assert peak_memory_bytes(CPU) > held.nbytes
 
 
 def test_the_log_has_speed_memory_and_time_over_all_starts(
-    store: FeatureStore, params: Make, trainer: Make, monkeypatch: pytest.MonkeyPatch, capsys: Said
-) -> None:
+    store, params, trainer, monkeypatch, capsys
+):
     readings = count()  # every look at the clock takes a thousandth of a second
     monkeypatch.setattr("pipeline.train.progress.time.perf_counter", lambda: next(readings) / 1000)
     begun = trainer(store, params(max_steps=30))
@@ -153,7 +121,7 @@ def test_the_log_has_speed_memory_and_time_over_all_starts(
     assert said.endswith((" MiB", " GiB"))
 
 
-def test_groups_that_were_cut_by_time_count_once(store: FeatureStore, params: Make) -> None:
+def test_groups_that_were_cut_by_time_count_once(store, params):
     thirds = np.array_split(np.arange(30), 3)
     named = {episode_name(episode): episode_name(episode) for episode in store.episodes}
     shape = policy_shape(store, fit_normalization(store, thirds[0], WINDOWS))
@@ -162,7 +130,7 @@ def test_groups_that_were_cut_by_time_count_once(store: FeatureStore, params: Ma
 
 
 @pytest.fixture
-def warnings(store: FeatureStore, params: Make) -> Callable[..., list[str]]:
+def warnings(store, params):
     """`warnings(train, key=value, ...)`: of a training on these ticks, the others held out."""
 
     def found(train: np.ndarray, absent: dict[str, int] | None = None, **head: Any) -> list[str]:
@@ -176,13 +144,7 @@ def warnings(store: FeatureStore, params: Make) -> Callable[..., list[str]]:
     return found
 
 
-def test_nothing_is_said_where_every_source_and_stream_is_trained_on(
-    store: FeatureStore, warnings: Make
-) -> None:
-    assert warnings(split_by_episode(store, SplitParams(val=0.3)).train) == []
-
-
-def test_a_source_without_a_training_episode_is_named_with_the_way_out(warnings: Make) -> None:
+def test_a_source_without_a_training_episode_is_named_with_the_way_out(warnings):
     """Episodes of 30 ticks: left, right, left, …"""
     (line,) = warnings(np.arange(30), split={"val": 0.4})
     assert line.startswith("warning: source 'right'")
@@ -190,19 +152,16 @@ def test_a_source_without_a_training_episode_is_named_with_the_way_out(warnings:
     assert warnings(np.arange(30), mixture={"right": 0.0}) == [], "the user wants it so"
 
 
-def test_a_stream_that_no_training_episode_has_is_named(
-    store: FeatureStore, warnings: Make
-) -> None:
+def test_a_stream_that_no_training_episode_has_is_named(store, warnings):
     train, absent = np.arange(store.ticks), {"sensor_channels": 0}
+    assert warnings(train) == []
     (line,) = warnings(train, absent)
     assert line.startswith("warning: sensor")
     assert "the training episodes' windows" in line and "train_head.split" in line
     assert warnings(train, absent, sensor_enabled=False) == []
 
 
-def test_a_training_says_it_last_before_it_begins(
-    tiny_store: Make, trainer: Make, params: Make, tmp_path: Path
-) -> None:
+def test_a_training_says_it_last_before_it_begins(tiny_store, trainer, params, tmp_path):
     """Of two recordings one is held out, and with it its source."""
     two = FeatureStore.open(tiny_store(tmp_path, episodes=2))
     *_, last = trainer(two, params()).summary()

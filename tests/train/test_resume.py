@@ -1,21 +1,17 @@
 """From whichever step a run goes on, it does what it would have done."""
 
 import shutil
-from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
 
 from pipeline.base.errors import CheckpointMismatch
-from pipeline.store import FeatureStore
 from pipeline.train.checkpoints import load_weights
 from pipeline.train.loop import Trainer
 from pipeline.train.process_group import ProcessGroup
 from pipeline.train.run import open_run
 
-Make = Callable[..., Any]
 STEPS = 4
 
 
@@ -28,14 +24,8 @@ def weights(trainer: Trainer) -> list[torch.Tensor]:
     ("model_type", "accumulation"), [("regression", 3), ("diffusion", 1), ("flow_matching", 2)]
 )
 def test_every_step_can_be_gone_on_from(
-    store: FeatureStore,
-    params: Make,
-    trainer: Make,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    model_type: str,
-    accumulation: int,
-) -> None:
+    store, params, trainer, tmp_path, monkeypatch, model_type, accumulation
+):
     chosen = {
         "model_type": model_type,
         "grad_accumulation": accumulation,
@@ -72,9 +62,7 @@ def test_every_step_can_be_gone_on_from(
 
 
 @pytest.fixture(scope="module")
-def of_two_parts(
-    store: FeatureStore, params_below: Make, trainer: Make, tmp_path_factory: pytest.TempPathFactory
-) -> Path:
+def of_two_parts(store, params_below, trainer, tmp_path_factory):
     """A finished run of two parts a step, to be copied."""
     chosen = params_below(tmp_path_factory.mktemp("parts"), grad_accumulation=2, max_steps=2)
     trainer(store, chosen).fit()
@@ -85,14 +73,8 @@ def of_two_parts(
     ("size", "accumulation", "status"), [(2, 1, "finished"), (1, 4, "new"), (2, 2, "new")]
 )
 def test_parts_may_be_shared_out_anew_but_not_cut_anew(
-    store: FeatureStore,
-    params: Make,
-    monkeypatch: pytest.MonkeyPatch,
-    of_two_parts: Path,
-    size: int,
-    accumulation: int,
-    status: str,
-) -> None:
+    store, params, monkeypatch, of_two_parts, size, accumulation, status
+):
     """What one process of two parts did is the run of two processes of one part, and no other."""
     shutil.copytree(of_two_parts, params().output)
     monkeypatch.setenv("WORLD_SIZE", str(size))
@@ -102,7 +84,7 @@ def test_parts_may_be_shared_out_anew_but_not_cut_anew(
     assert open_run(given, store, {"adapter": "another"}).status == "new"
 
 
-def test_weights_of_another_module_are_refused(tmp_path: Path) -> None:
+def test_weights_of_another_module_are_refused(tmp_path):
     stored = {"head.weight": torch.ones(2, 3)}
     for name, shape in (("head.weight", (3, 2)), ("tail.weight", (2, 3))):
         learning = {name: torch.nn.Parameter(torch.zeros(shape))}

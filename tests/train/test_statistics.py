@@ -1,9 +1,6 @@
 """The normalisation sees what training may see, once, and nothing else."""
 
-from collections.abc import Callable
 from dataclasses import asdict
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -17,16 +14,11 @@ from pipeline.store.chunks import write_seal
 from pipeline.train.batches import Windows
 from pipeline.train.statistics import anchored_channels, fit_normalization
 
-Patch = pytest.MonkeyPatch
-Make = Callable[..., Any]
-
 WINDOWS = Windows(8, 65, 100, 0.1, 1.0)
 
 
 @pytest.mark.parametrize("chunk_bytes", [500, 2**26])
-def test_statistics_are_those_of_the_training_ticks(
-    store: FeatureStore, monkeypatch: Patch, chunk_bytes: int
-) -> None:
+def test_statistics_are_those_of_the_training_ticks(store, monkeypatch, chunk_bytes):
     monkeypatch.setattr("pipeline.train.statistics.CHUNK_BYTES", chunk_bytes)
     # All of episode 1, and of episode 4 the first 7 ticks: a tail is held out.
     ticks = np.concatenate([np.arange(30, 60), np.arange(120, 127)])
@@ -52,9 +44,7 @@ def test_statistics_are_those_of_the_training_ticks(
 
 
 @pytest.mark.parametrize("chunk_bytes", [1, 2**26])
-def test_features_are_counted_over_all_variants(
-    tiny_store: Make, tmp_path: Path, monkeypatch: Patch, chunk_bytes: int
-) -> None:
+def test_features_are_counted_over_all_variants(tiny_store, tmp_path, monkeypatch, chunk_bytes):
     monkeypatch.setattr("pipeline.train.statistics.CHUNK_BYTES", chunk_bytes)
     path = tiny_store(tmp_path, slots=6)
     attrs = zarr.open_group(path, mode="r+").attrs
@@ -81,7 +71,7 @@ def test_features_are_counted_over_all_variants(
         fit_normalization(store, np.arange(30, 60), WINDOWS)
 
 
-def test_absent_streams_have_none_and_bfloat16_is_read(tiny_store: Make, tmp_path: Path) -> None:
+def test_absent_streams_have_none_and_bfloat16_is_read(tiny_store, tmp_path):
     store = FeatureStore.open(
         tiny_store(tmp_path, sensor_channels=0, state_dim=0, dtype="bfloat16")
     )
@@ -103,9 +93,7 @@ def test_absent_streams_have_none_and_bfloat16_is_read(tiny_store: Make, tmp_pat
         ("state/values", (121, 0), "right/episode_001, state reading 1 (at 0.025 s)"),
     ],
 )
-def test_a_number_that_is_none_is_named_by_episode_and_time(
-    tiny_store: Make, tmp_path: Path, array: str, row: tuple[int, ...], said: str
-) -> None:
+def test_a_number_that_is_none_is_named_by_episode_and_time(tiny_store, tmp_path, array, row, said):
     store = FeatureStore.open(tiny_store(tmp_path))
     store.array(array)[row] = np.nan
     with pytest.raises(NumericsError) as caught:
@@ -114,15 +102,13 @@ def test_a_number_that_is_none_is_named_by_episode_and_time(
     assert "found nan" in str(caught.value)
 
 
-def test_no_ticks_are_no_statistics(tiny_store: Make, tmp_path: Path) -> None:
+def test_no_ticks_are_no_statistics(tiny_store, tmp_path):
     with pytest.raises(NumericsError, match="no rows"):
         fit_normalization(FeatureStore.open(tiny_store(tmp_path)), np.arange(0), WINDOWS)
 
 
 @pytest.mark.parametrize("chunk_bytes", [300, 2**26])
-def test_threads_change_no_bit(
-    tiny_store: Make, tmp_path: Path, monkeypatch: Patch, chunk_bytes: int
-) -> None:
+def test_threads_change_no_bit(tiny_store, tmp_path, monkeypatch, chunk_bytes):
     monkeypatch.setattr("pipeline.train.statistics.CHUNK_BYTES", chunk_bytes)
     monkeypatch.setattr("pipeline.policy.normalization._PIECE_VALUES", 40)
     store = FeatureStore.open(tiny_store(tmp_path))
@@ -148,8 +134,8 @@ def test_threads_change_no_bit(
     ],
 )
 def test_anchored_are_translations_that_go_either_way(
-    tiny_store: Make, tmp_path: Path, monkeypatch: Patch, changed: dict[str, Any], anchor: Any
-) -> None:
+    tiny_store, tmp_path, monkeypatch, changed, anchor
+):
     store = FeatureStore.open(tiny_store(tmp_path))
     state = {"names": ["x", "z", "a", "gripper"], "units": ["mm", "mm", "deg", ""]}
     streams = store.streams | {"state": store.streams["state"] | state}
@@ -160,9 +146,7 @@ def test_anchored_are_translations_that_go_either_way(
     assert anchored_channels(store, np.arange(store.ticks), params) == anchor
 
 
-def test_what_rested_in_training_is_no_unit_of_what_moves_later(
-    tiny_store: Make, tmp_path: Path
-) -> None:
+def test_what_rested_in_training_is_no_unit_of_what_moves_later(tiny_store, tmp_path):
     path = tiny_store(tmp_path)
     store = FeatureStore.open(path)
     readings = store.array("state/values")
@@ -172,7 +156,7 @@ def test_what_rested_in_training_is_no_unit_of_what_moves_later(
     assert fitted.std[1] == pytest.approx(0.05 * np.sort(fitted.std)[-2:].min(), rel=0.5)
 
 
-def test_angles_are_fitted_as_a_policy_takes_them(tiny_store: Make, tmp_path: Path) -> None:
+def test_angles_are_fitted_as_a_policy_takes_them(tiny_store, tmp_path):
     path = tiny_store(tmp_path)
     streams = dict(zarr.open_group(path, mode="r").attrs["streams"])
     streams["state"] |= {"units": ["deg"] * len(streams["state"]["names"])}

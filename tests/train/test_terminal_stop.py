@@ -1,8 +1,5 @@
 """Beyond the end a robot stands still, and learns to."""
 
-from collections.abc import Callable
-from typing import Any
-
 import numpy as np
 import pytest
 import torch
@@ -11,15 +8,12 @@ from pipeline.policy.observation import moving_channels
 from pipeline.store import FeatureStore
 from pipeline.train.loop import stand_still
 
-Make = Callable[..., Any]
 LAST = [29, 28, 5]
 """The last tick of the first episode, the one before it, and one in its midst."""
 
 
 @pytest.mark.parametrize("kind", ["delta", "velocity", "absolute"])
-def test_what_is_done_beyond_the_end(
-    store: FeatureStore, monkeypatch: pytest.MonkeyPatch, kind: str
-) -> None:
+def test_what_is_done_beyond_the_end(store, monkeypatch, kind):
     streams = store.streams | {"action": store.streams["action"] | {"kind": kind}}
     monkeypatch.setattr(FeatureStore, "streams", streams)
     batch = store.gather(LAST, 3, 1, 1)
@@ -38,7 +32,7 @@ def test_what_is_done_beyond_the_end(
         assert torch.equal(action[row, real:], beyond.expand(3 - real, -1))
 
 
-def test_a_run_learns_to_stop(store: FeatureStore, params: Make, trainer: Make) -> None:
+def test_a_run_learns_to_stop(store, params, trainer):
     """With a chunk longer than an episode most of what is learnt is standing still."""
     chosen = {"horizon": 40, "max_steps": 60, "lr": 1e-2, "eval_every": 60}
     stopping = trainer(store, params(**chosen, terminal_stop=True))

@@ -1,8 +1,7 @@
 """The ticks that a checkpoint lists on a side are found again, or refused by name."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -42,9 +41,7 @@ def find(store: FeatureStore, test: Parts) -> tuple[list[int], Any]:
 
 
 @pytest.mark.parametrize("episodes", [1, 2, 6])
-def test_the_split_is_found_again(
-    tiny_store: Callable[..., Path], tmp_path: Path, episodes: int
-) -> None:
+def test_the_split_is_found_again(tiny_store, tmp_path, episodes):
     store = FeatureStore.open(tiny_store(tmp_path, episodes=episodes))
     split = split_by_episode(store, SplitParams(), horizon=3)
     listed: Any = Listed(split_parts(store, split))
@@ -60,7 +57,7 @@ def test_the_split_is_found_again(
         assert listed.split["train"]["left/episode_000"].ticks == (0, 18)
 
 
-def test_episodes_that_are_gone_or_shorter_are_named(store: FeatureStore) -> None:
+def test_episodes_that_are_gone_or_shorter_are_named(store):
     assert find(store, parts(right_001=(10, 30, "0-1")))[0] == list(range(40, 60))
     message = (
         r"of the 3 test episodes .* 2 are missing, shorter, .*: left/episode_gone, "
@@ -73,13 +70,13 @@ def test_episodes_that_are_gone_or_shorter_are_named(store: FeatureStore) -> Non
         find(store, {})
 
 
-def test_other_recordings_of_the_same_names_and_lengths_are_refused(store: FeatureStore) -> None:
+def test_other_recordings_of_the_same_names_and_lengths_are_refused(store):
     message = r"of the 2 test episodes .* 1 are .* other recordings .*: right/episode_001\."
     with pytest.raises(CheckpointMismatch, match=message):
         find(store, parts(left_000=(0, 30, "0-0"), right_001=(0, 30, "another recording")))
 
 
-def test_renamed_episodes_are_told_by_their_content(store: FeatureStore) -> None:
+def test_renamed_episodes_are_told_by_their_content(store):
     """Also where two of them have taken each other's name; they keep their groups."""
     wanted = parts(left_old=(3, 9, "0-2"), left_000=(0, 7, "0-1"), right_001=(5, 6, "0-0"))
     ticks, named = find(store, wanted)
@@ -94,6 +91,6 @@ def test_renamed_episodes_are_told_by_their_content(store: FeatureStore) -> None
     assert groups.tolist() == ["group of right_001", "group of left_000", "group of left_old"]
 
 
-def test_an_episode_that_is_gone_is_not_hidden_by_one_under_its_name(store: FeatureStore) -> None:
+def test_an_episode_that_is_gone_is_not_hidden_by_one_under_its_name(store):
     with pytest.raises(CheckpointMismatch, match=r"of the 2 test episodes .* 1 are missing"):
         find(store, parts(left_000=(0, 7, "removed since"), left_009=(0, 9, "0-0")))

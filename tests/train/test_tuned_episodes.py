@@ -1,6 +1,5 @@
 """Episodes that a store's model was tuned or chosen on do not judge policies on top of it."""
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -26,8 +25,6 @@ from pipeline.store.chunks import write_seal
 from pipeline.train.split import Split, split_by_episode
 from pipeline.train.training_data import refuse_tuned_episodes
 
-Make = Callable[..., Path]
-
 
 def part(number: int, ticks: tuple[int, int] = (0, 30), content: str | None = None) -> TunedPart:
     name = f"{('left', 'right')[number % 2]}/episode_{number:03d}"
@@ -35,7 +32,7 @@ def part(number: int, ticks: tuple[int, int] = (0, 30), content: str | None = No
 
 
 @pytest.fixture
-def tuned_store(tiny_store: Make, tmp_path: Path) -> Callable[..., FeatureStore]:
+def tuned_store(tiny_store, tmp_path):
     """`tuned_store(tuned, episodes=6)`: a store whose adapter says that, or nothing for None."""
 
     def make(tuned: TunedOn | None, episodes: int = 6) -> FeatureStore:
@@ -57,9 +54,7 @@ def whole(store: FeatureStore, **sides: list[int]) -> Split:
     return Split(**arrays, groups=dict(zip(names, names, strict=True)), note=None)
 
 
-def test_what_it_was_tuned_or_chosen_on_is_refused(
-    tuned_store: Callable[..., FeatureStore],
-) -> None:
+def test_what_it_was_tuned_or_chosen_on_is_refused(tuned_store):
     store = tuned_store(TunedOn(train=(part(0), part(1)), val=(part(2),)))
     assert refuse_tuned_episodes(store, whole(store, train=[0, 1], val=[2, 3], test=[4, 5])) == []
     with pytest.raises(ConfigError, match=r"\(test: left/episode_002\).* same seed above all"):
@@ -68,9 +63,7 @@ def test_what_it_was_tuned_or_chosen_on_is_refused(
         refuse_tuned_episodes(store, whole(store, train=[2], val=[0, 3], test=[1]))
 
 
-def test_episodes_are_known_by_content_and_a_group_is_known_whole(
-    tuned_store: Callable[..., FeatureStore],
-) -> None:
+def test_episodes_are_known_by_content_and_a_group_is_known_whole(tuned_store):
     store = tuned_store(TunedOn(train=(part(9, content="0-3"), part(0, content="elsewhere"))))
     split = whole(store, train=[1], val=[2], test=[0, 3, 5])
     split.groups["right/episode_005"] = "right/episode_003"  # type: ignore[index]
@@ -78,9 +71,7 @@ def test_episodes_are_known_by_content_and_a_group_is_known_whole(
         refuse_tuned_episodes(store, split)
 
 
-def test_a_recording_cut_by_time_may_be_on_all_sides(
-    tuned_store: Callable[..., FeatureStore],
-) -> None:
+def test_a_recording_cut_by_time_may_be_on_all_sides(tuned_store):
     store = tuned_store(TunedOn(train=(part(0, (0, 18)),), val=(part(0, (20, 24)),)), episodes=1)
     split = split_by_episode(store, SplitParams(), horizon=3)
     assert refuse_tuned_episodes(store, split) == []
@@ -89,16 +80,14 @@ def test_a_recording_cut_by_time_may_be_on_all_sides(
         refuse_tuned_episodes(store, earlier)
 
 
-def test_an_adapter_that_says_nothing_is_told_of(
-    tuned_store: Callable[..., FeatureStore], store: FeatureStore
-) -> None:
+def test_an_adapter_that_says_nothing_is_told_of(tuned_store, store):
     silent = tuned_store(None)
     (line,) = refuse_tuned_episodes(silent, whole(silent, train=[0], test=[1]))
     assert "does not say what it was tuned on" in line
     assert refuse_tuned_episodes(store, whole(store, train=[0], test=[1])) == []
 
 
-def test_it_comes_back_and_damage_is_named(tmp_path: Path) -> None:
+def test_it_comes_back_and_damage_is_named(tmp_path):
     assert read_tuned_on(tmp_path) is None
     tuned = TunedOn(train=(part(0), part(1, (3, 9))), val=(part(2),))
     write_tuned_on(tmp_path, tuned)

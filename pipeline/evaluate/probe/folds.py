@@ -9,7 +9,7 @@ from sklearn.model_selection import GroupKFold
 from pipeline.base.errors import StoreMismatch
 from pipeline.store import FeatureStore
 from pipeline.train.batches import evenly
-from pipeline.train.groups import episodes_by_group
+from pipeline.train.split import episodes_by_group
 
 _PARTS = 4
 """The most parts of a fold; parts are dealt as units. This bounds time and memory."""

@@ -3,7 +3,6 @@
 import copy
 import json
 import shutil
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -74,9 +73,7 @@ def write_episode(folder: Path, seed: int, views: tuple[str, ...] = VIEWS) -> No
 
 
 @pytest.fixture(scope="session")
-def _made(
-    tmp_path_factory: pytest.TempPathFactory, demo_checkpoint: Path
-) -> tuple[Path, dict[str, Any]]:
+def _made(tmp_path_factory, demo_checkpoint):
     """Recordings, and params.yaml as it would be read, of a finished store."""
     root = tmp_path_factory.mktemp("finetuning")
     for seed in range(4):
@@ -100,7 +97,7 @@ def _made(
 
 
 @pytest.fixture
-def document(_made: tuple[Path, dict[str, Any]], tmp_path: Path) -> dict[str, Any]:
+def document(_made, tmp_path):
     """params.yaml as it would be read, to be changed by a test, which must not change files."""
     document = copy.deepcopy(_made[1])
     document["finetune"] |= {"output": str(tmp_path / "tuned"), "logs": str(tmp_path / "logs")}
@@ -108,7 +105,7 @@ def document(_made: tuple[Path, dict[str, Any]], tmp_path: Path) -> dict[str, An
 
 
 @pytest.fixture
-def own_recordings(document: dict[str, Any], tmp_path: Path) -> Path:
+def own_recordings(document, tmp_path):
     """A copy of the recordings, that `document` names from now on, to be changed by a test."""
     copied = shutil.copytree(document["data"]["root"], tmp_path / "recordings")
     document["data"]["root"] = str(copied)
@@ -116,12 +113,12 @@ def own_recordings(document: dict[str, Any], tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def store(document: dict[str, Any]) -> FeatureStore:
+def store(document):
     return FeatureStore.open(document["extract"]["store"])
 
 
 @pytest.fixture
-def params(document: dict[str, Any]) -> Callable[..., Params]:
+def params(document):
     """`params(vlm={...}, ...)`: the document with some values laid over."""
 
     def lay_over(**sections: dict[str, Any]) -> Params:

@@ -1,9 +1,7 @@
 """The one training loop with a model that learns in front."""
 
 import json
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -29,8 +27,6 @@ from pipeline.train.split import split_by_episode
 from pipeline.train.training_data import check_store, find_ticks, refuse_tuned_episodes
 from pipeline.vlm.feature_spec import feature_spec
 
-Make = Callable[..., Any]
-
 CPU = torch.device("cpu")
 
 
@@ -52,9 +48,7 @@ def weights(module: nn.Module) -> dict[str, torch.Tensor]:
     return {n: p.detach().clone() for n, p in module.named_parameters() if p.requires_grad}
 
 
-def test_all_that_learns_does_at_its_own_rate_and_the_loss_falls(
-    params: Make,
-) -> None:
+def test_all_that_learns_does_at_its_own_rate_and_the_loss_falls(params):
     still = {"dim": 16, "layers": 1, "heads": 2, "dropout": 0.0}
     given = params(
         train_head={"expert": still, "lr_schedule": "constant"},
@@ -78,7 +72,7 @@ def test_all_that_learns_does_at_its_own_rate_and_the_loss_falls(
     assert losses[-6:].mean() < 0.7 * losses[:6].mean()
 
 
-def test_what_is_kept_is_the_averaged_model_that_was_judged(params: Make, tmp_path: Path) -> None:
+def test_what_is_kept_is_the_averaged_model_that_was_judged(params, tmp_path):
     """Extracted with the adapter, features are the live ones, and the policy takes them."""
     given = params(finetune={"max_steps": 4, "eval_every": 4, "eval_ticks": 100})
     made = trainer(given)
@@ -133,9 +127,7 @@ def test_what_is_kept_is_the_averaged_model_that_was_judged(params: Make, tmp_pa
     assert comparison.overall("policy") == pytest.approx(best.metrics["val/error"], rel=1e-3)
 
 
-def test_a_run_goes_on_from_any_checkpoint_to_the_same_bits(
-    params: Make, tmp_path: Path, stop_at: Make
-) -> None:
+def test_a_run_goes_on_from_any_checkpoint_to_the_same_bits(params, tmp_path, stop_at):
     whole = trainer(params(finetune={"output": str(tmp_path / "whole"), "max_steps": 4}))
     whole.fit()
     given = params(finetune={"output": str(tmp_path / "stopped"), "max_steps": 4})
@@ -150,30 +142,7 @@ def test_a_run_goes_on_from_any_checkpoint_to_the_same_bits(
         assert all(torch.equal(one[name], other[name]) for name in one)
 
 
-def test_parts_of_a_step_give_the_whole_step(params: Make, tmp_path: Path) -> None:
-    losses = []
-    # Dropout differs from part to part.
-    still = {"tuning": {"lora_r": 4, "lora_alpha": 8, "lora_dropout": 0.0}}
-    for parts in (1, 3):
-        made = trainer(
-            params(
-                train_head={"expert": {"dim": 16, "layers": 1, "heads": 2, "dropout": 0.0}},
-                finetune={
-                    **still,
-                    "max_steps": 2,
-                    "grad_accumulation": parts,
-                    "output": str(tmp_path / f"parts{parts}"),
-                },
-            )
-        )
-        made.fit()
-        losses.append(made.history.tensor())
-    torch.testing.assert_close(losses[0], losses[1], atol=1e-4, rtol=1e-3)
-
-
-def test_a_setting_that_decides_the_numbers_is_another_run(
-    store: FeatureStore, params: Make
-) -> None:
+def test_a_setting_that_decides_the_numbers_is_another_run(store, params):
     before = ModelFeatureSource(store, params(), CPU).identity
     json.dumps(before)
     small = {"lora_r": 4, "lora_alpha": 8}
@@ -186,7 +155,7 @@ def test_a_setting_that_decides_the_numbers_is_another_run(
         assert (before != after) == another, changed
 
 
-def test_full_tuning_saves_a_checkpoint_to_extract_with(params: Make, tmp_path: Path) -> None:
+def test_full_tuning_saves_a_checkpoint_to_extract_with(params, tmp_path):
     given = params(finetune={"tuning": {"method": "full"}, "max_steps": 1, "lr": 1e-4})
     made = trainer(given)
     made.fit()
@@ -198,12 +167,12 @@ def test_full_tuning_saves_a_checkpoint_to_extract_with(params: Make, tmp_path: 
     check_store(load_policy(best), FeatureStore.open(tmp_path / "full.zarr"))
 
 
-def test_a_gpu_that_is_too_small_ends_in_what_takes_less() -> None:
+def test_a_gpu_that_is_too_small_ends_in_what_takes_less():
     with pytest.raises(ConfigError, match=r"finetune\.grad_accumulation"), out_of_memory_named():
         raise torch.cuda.OutOfMemoryError("tried to allocate 2.00 GiB")
 
 
-def test_what_is_not_used_of_a_store_is_said(params: Make, tmp_path: Path) -> None:
+def test_what_is_not_used_of_a_store_is_said(params, tmp_path):
     document = params().model_dump(mode="json")
     document["vlm"]["variants"] = 2
     document["extract"]["store"] = str(tmp_path / "variants.zarr")

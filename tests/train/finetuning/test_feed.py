@@ -1,10 +1,8 @@
 """A live feed hands out the store's batches with the rows of their ticks."""
 
 import threading
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import fields
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -15,19 +13,22 @@ from pipeline.base.errors import RecordingError
 from pipeline.policy.observation import LiveObservation
 from pipeline.store import Batch, FeatureStore
 from pipeline.train.batches import BatchIndices, Windows
-from pipeline.train.finetuning.recordings import check_spec, find_recordings, known_digests
-from pipeline.train.finetuning.rows import LiveFeed, LiveRows
+from pipeline.train.finetuning_rows import (
+    LiveFeed,
+    LiveRows,
+    check_spec,
+    find_recordings,
+    known_digests,
+)
 from pipeline.vlm.live import LiveVLM
 from pipeline.vlm.preparation import Preparer
-
-Make = Callable[..., Any]
 
 WINDOWS = Windows(2, 1, 3)
 CPU = torch.device("cpu")
 
 
 @pytest.fixture
-def feed(store: FeatureStore, params: Make) -> Make:
+def feed(store, params):
     """`feed(plan)`, over rows of its own."""
 
     def make(plan: Iterable[BatchIndices], threads: int = 2) -> LiveFeed:
@@ -44,9 +45,7 @@ def plan_of(store: FeatureStore, draws: int, batch: int) -> list[BatchIndices]:
     return [BatchIndices(rng.integers(0, store.ticks, batch)) for _ in range(draws)]
 
 
-def test_batches_are_the_stores_and_rows_those_of_their_ticks(
-    store: FeatureStore, feed: Make
-) -> None:
+def test_batches_are_the_stores_and_rows_those_of_their_ticks(store, feed):
     plan = plan_of(store, 7, 9)
     seen = 0
     with feed(plan, 3) as batches:
@@ -67,9 +66,7 @@ def test_batches_are_the_stores_and_rows_those_of_their_ticks(
     assert seen == len(plan)
 
 
-def test_an_untuned_model_gives_the_cached_features(
-    store: FeatureStore, feed: Make, params: Make
-) -> None:
+def test_an_untuned_model_gives_the_cached_features(store, feed, params):
     with known_digests(store) as digests:
         spec = check_spec(store, params(), digests)
     vlm = LiveVLM.load(params().vlm, spec, TuningParams(method="none"), "cpu").eval()
@@ -82,9 +79,7 @@ def test_an_untuned_model_gives_the_cached_features(
     torch.testing.assert_close(features[batch.row_of], batch.features, atol=2e-5, rtol=1e-4)
 
 
-def test_another_device_takes_the_tensors_and_leaves_the_rows(
-    store: FeatureStore, feed: Make
-) -> None:
+def test_another_device_takes_the_tensors_and_leaves_the_rows(store, feed):
     with feed(plan_of(store, 1, 4)) as batches:
         _, batch = next(batches)
     moved = batch.to("meta")
@@ -93,9 +88,7 @@ def test_another_device_takes_the_tensors_and_leaves_the_rows(
     assert moved.rows is batch.rows
 
 
-def test_a_frame_that_is_gone_comes_out_at_its_batch(
-    store: FeatureStore, feed: Make, own_recordings: Path
-) -> None:
+def test_a_frame_that_is_gone_comes_out_at_its_batch(store, feed, own_recordings):
     first, second = store.episodes[0].ticks, store.episodes[1].ticks
 
     def plan() -> Iterator[BatchIndices]:  # read once the recordings are open, before the first row
@@ -109,7 +102,7 @@ def test_a_frame_that_is_gone_comes_out_at_its_batch(
             next(batches)
 
 
-def test_threads_end_with_the_feed(store: FeatureStore, feed: Make) -> None:
+def test_threads_end_with_the_feed(store, feed):
     before = {*threading.enumerate()}
     with feed(plan_of(store, 50, 16)) as batches:
         next(batches)

@@ -1,16 +1,13 @@
 """Which of two sections a training follows."""
 
-from collections.abc import Callable
-
 import pytest
 from pydantic import ValidationError
 
-from pipeline.base.config import Params
 from pipeline.base.errors import ConfigError
 from pipeline.train.finetuning import head_params
 
 
-def test_finetune_is_laid_over_train_head(params: Callable[..., Params]) -> None:
+def test_finetune_is_laid_over_train_head(params):
     given = params(train_head={"batch_size": 99, "seed": 3, "drop_features": 0.2, "compile": True})
     head = head_params(given)
     assert (head.batch_size, head.max_steps, head.eval_every) == (6, 5, 3)
@@ -26,16 +23,12 @@ def test_finetune_is_laid_over_train_head(params: Callable[..., Params]) -> None
         ("train_head", {"features_enabled": False}, "would not see the model that is tuned"),
     ],
 )
-def test_what_cannot_be_tuned_is_refused(
-    params: Callable[..., Params], section: str, values: dict[str, object], said: str
-) -> None:
+def test_what_cannot_be_tuned_is_refused(params, section, values, said):
     with pytest.raises(ConfigError, match=said):
         head_params(params(**{section: values}))
 
 
 @pytest.mark.parametrize(("section", "place"), [("finetune", "output"), ("train_head", "logs")])
-def test_what_is_renamed_is_a_folder_of_its_own(
-    params: Callable[..., Params], section: str, place: str
-) -> None:
+def test_what_is_renamed_is_a_folder_of_its_own(params, section, place):
     with pytest.raises(ValidationError, match=rf"{section}\.{place}\n.*a folder of its own"):
         params(**{section: {place: "."}})

@@ -2,9 +2,6 @@
 
 import json
 import shutil
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any
 
 import pytest
 from PIL import Image
@@ -12,14 +9,12 @@ from PIL import Image
 from pipeline.base.config import Params
 from pipeline.base.errors import StoreMismatch
 from pipeline.store import FeatureStore
-from pipeline.train.finetuning.recordings import (
+from pipeline.train.finetuning_rows import (
     check_recordings,
     check_spec,
     find_recordings,
     known_digests,
 )
-
-Make = Callable[..., Any]
 
 TASK = "Follow_disc"
 
@@ -29,9 +24,7 @@ def check(store: FeatureStore, params: Params) -> None:
         check_recordings(store, find_recordings(store, params), digests)
 
 
-def test_recordings_come_in_the_order_of_episodes_wherever_they_lie(
-    store: FeatureStore, params: Make, own_recordings: Path
-) -> None:
+def test_recordings_come_in_the_order_of_episodes_wherever_they_lie(store, params, own_recordings):
     added = own_recordings / TASK / "episode_00"
     shutil.copytree(own_recordings / TASK / "episode_0", added)
     found = find_recordings(store, params())
@@ -41,9 +34,7 @@ def test_recordings_come_in_the_order_of_episodes_wherever_they_lie(
     check(store, params())
 
 
-def test_a_missing_recording_is_named(
-    store: FeatureStore, params: Make, own_recordings: Path
-) -> None:
+def test_a_missing_recording_is_named(store, params, own_recordings):
     shutil.rmtree(own_recordings / TASK / "episode_2")
     (own_recordings / TASK / "episode_1" / "metadata.json").write_text("{")
     with pytest.raises(StoreMismatch) as refused:
@@ -56,7 +47,7 @@ def test_a_missing_recording_is_named(
     assert "python -m stages.extract" in said
 
 
-def test_a_changed_file_is_named(store: FeatureStore, params: Make, own_recordings: Path) -> None:
+def test_a_changed_file_is_named(store, params, own_recordings):
     frame = next((own_recordings / TASK / "episode_1" / "images" / "View1").iterdir())
     Image.new("RGB", (64, 48)).save(frame)
     with pytest.raises(StoreMismatch, match=r"made/episode_1: the files in .* changed since") as no:
@@ -64,20 +55,20 @@ def test_a_changed_file_is_named(store: FeatureStore, params: Make, own_recordin
     assert "of its 4 episodes 1 cannot" in str(no.value)
 
 
-def test_a_moved_frame_is_a_change(store: FeatureStore, params: Make, own_recordings: Path) -> None:
+def test_a_moved_frame_is_a_change(store, params, own_recordings):
     frame = next((own_recordings / TASK / "episode_3" / "images" / "View2").iterdir())
     frame.rename(frame.with_name(f"{float(frame.stem) + 0.004:.3f}.jpg"))
     with pytest.raises(StoreMismatch, match="made/episode_3"):
         check(store, params())
 
 
-def test_another_instruction_is_named(store: FeatureStore, params: Make) -> None:
+def test_another_instruction_is_named(store, params):
     told = params(data={"sources": [{"name": "made", "path": ".", "instruction": "Run away"}]})
     with pytest.raises(StoreMismatch, match="'Follow disc' at extraction, 'Run away' now"):
         check(store, told)
 
 
-def test_the_model_of_the_store_is_asked_for(store: FeatureStore, params: Make) -> None:
+def test_the_model_of_the_store_is_asked_for(store, params):
     with known_digests(store) as digests:
         assert check_spec(store, params(), digests).digest == store.spec["digest"]
         # What decides no feature may differ.
@@ -91,9 +82,7 @@ def test_the_model_of_the_store_is_asked_for(store: FeatureStore, params: Make) 
         ({"image_resize_height": 84}, "processor.image_size"),
     ],
 )
-def test_another_model_is_refused_with_the_entries_that_differ(
-    store: FeatureStore, params: Make, changed: dict[str, Any], entry: str
-) -> None:
+def test_another_model_is_refused_with_the_entries_that_differ(store, params, changed, entry):
     vlm = json.loads(params().vlm.model_dump_json()) | changed
     with known_digests(store) as digests, pytest.raises(StoreMismatch) as refused:
         check_spec(store, params(vlm=vlm), digests)

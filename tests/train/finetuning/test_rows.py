@@ -1,8 +1,7 @@
 """A row of the store shows the very frames that extraction saw."""
 
 from collections import Counter
-from collections.abc import Callable, Mapping
-from pathlib import Path
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -16,12 +15,9 @@ from pipeline.extract import extract
 from pipeline.simulation.insertion_formats import write_lerobot
 from pipeline.simulation.recorder import simulate_episode
 from pipeline.store import FeatureStore
-from pipeline.train.finetuning.recordings import check_spec, find_recordings, known_digests
-from pipeline.train.finetuning.rows import LiveRows
+from pipeline.train.finetuning_rows import LiveRows, check_spec, find_recordings, known_digests
 from pipeline.vlm.feature_spec import FeatureSpec
 from pipeline.vlm.preparation import PreparedRow, Preparer
-
-Make = Callable[..., Any]
 
 
 class Watched(Preparer):
@@ -56,9 +52,7 @@ def prepare_all(rows: LiveRows, wanted: NDArray[np.int64]) -> dict[int, Prepared
     }
 
 
-def test_rows_show_what_extraction_saw_and_are_decoded_once(
-    store: FeatureStore, params: Make
-) -> None:
+def test_rows_show_what_extraction_saw_and_are_decoded_once(store, params):
     rows, watched = live_rows(store, params())
     wanted = np.random.default_rng(0).integers(0, len(store.array("vl/time")), 200)
     first = prepare_all(rows, wanted[:10])
@@ -67,9 +61,7 @@ def test_rows_show_what_extraction_saw_and_are_decoded_once(
     assert all(again[row] is prepared for row, prepared in first.items())
 
 
-def test_rows_of_a_video_are_read_in_one_pass(
-    document: dict[str, Any], params: Make, tmp_path: Path
-) -> None:
+def test_rows_of_a_video_are_read_in_one_pass(document, params, tmp_path):
     write_lerobot(tmp_path / "videos", [simulate_episode(5, 1.7e9)])
     document["data"] = {
         "root": str(tmp_path),
@@ -86,7 +78,7 @@ def test_rows_of_a_video_are_read_in_one_pass(
     assert watched.keys == keys(store, wanted)
 
 
-def test_kept_rows_stay_within_their_bytes(store: FeatureStore, params: Make) -> None:
+def test_kept_rows_stay_within_their_bytes(store, params):
     last = store.episodes[-1].vl_rows
     size = 2 * 56 * 84 * 3
     rows, watched = live_rows(store, params(), cache_bytes=3 * size)
@@ -99,9 +91,7 @@ def test_kept_rows_stay_within_their_bytes(store: FeatureStore, params: Make) ->
     assert watched.keys.total() == 2
 
 
-def test_a_frame_that_is_gone_is_named(
-    store: FeatureStore, params: Make, own_recordings: Path
-) -> None:
+def test_a_frame_that_is_gone_is_named(store, params, own_recordings):
     rows, _ = live_rows(store, params())
     rows.prepare(np.array([0]))
     for frame in (own_recordings / "Follow_disc" / "episode_0" / "images" / "View1").iterdir():

@@ -1,14 +1,15 @@
-"""Chunks that count from the newest frame: what was seen stays true while the model is late.
+"""Robot states: their channels as networks take them, and chunks that count from a past state.
 
-What vision tells, such as the way to a target, is true of the time of the frame. So anchored
+What vision tells, such as the way to a target, is true at the time of the frame. So anchored
 channels of a chunk count from the state at that time: in training the first step has the motion
-since then added, and the policy's answer has the measured motion subtracted. A late frame then
-names the same place. The steps behind the first count from the step before, as ever.
+since then added, and the policy's answer has the measured motion subtracted. So the target stays in
+place while the model is late. Every later step counts from the step before it.
 
-The state is interpolated on its own clock, between the readings of its window; before the first of
-them the arm is taken to have stood where that says.
+The state is interpolated on its own clock, between the readings of its window; before the first
+reading the arm is assumed to stand still.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -18,11 +19,33 @@ from torch import Tensor
 
 from pipeline.base.observation import Observation
 from pipeline.policy.shape import Anchor, Kind
-from pipeline.policy.state_channels import rotation_matrix
 
 Chunks = Float[Tensor, "*sample batch horizon action"]
 _FULL_TURN: dict[Kind, float] = {"deg": 360.0, "rad": 2 * torch.pi, "rotation": 360.0}
 _LEAST = 1e-12
+
+
+def expand(
+    values: Float[Tensor, "batch reading channel"], kinds: Sequence[Kind]
+) -> Float[Tensor, "batch reading expanded"]:
+    """Windows of states (float32) with angles as sines and cosines, and rotations in six numbers.
+
+    A pose's rotation R = Rx(a)·Ry(b)·Rz(r) is taken relative to that of the window's last reading,
+    and written as the first two columns of the matrix (Zhou et al. 2019, "On the Continuity of
+    Rotation Representations", section 4.2). So another full turn changes nothing.
+    """
+    if not {*kinds} - {"plain"}:
+        return values
+    values = values.float()
+    parts = [_of_kind(values, kinds, "plain")]
+    degrees = [math.pi / 180 if kind == "deg" else 1.0 for kind in kinds if kind in ("deg", "rad")]
+    angles = _of_kind(values, kinds, "deg", "rad") * values.new_tensor(degrees)
+    parts += [angles.sin(), angles.cos()]
+    if "rotation" in kinds:
+        matrices = rotation_matrix(_of_kind(values, kinds, "rotation").deg2rad())
+        relative = matrices[:, -1:].mT @ matrices
+        parts.append(relative[..., :2].mT.flatten(2))
+    return torch.cat(parts, dim=-1)
 
 
 @dataclass(frozen=True)
@@ -37,11 +60,11 @@ class Anchoring:
     kinds: Sequence[Kind]
 
     def from_frame(self, chunks: Chunks, seen: Observation) -> Chunks:
-        """Chunks that count from the newest frame, of those that count from the tick."""
+        """The chunks counted from the newest frame; `chunks` count from the tick."""
         return self._moved(chunks, seen, 1.0)
 
     def from_tick(self, chunks: Chunks, seen: Observation) -> Chunks:
-        """The inverse of `from_frame`: what the robot executes."""
+        """The inverse of `from_frame`: the chunks that the robot executes."""
         return self._moved(chunks, seen, -1.0)
 
     def _moved(self, chunks: Chunks, seen: Observation, sign: float) -> Chunks:
@@ -67,7 +90,7 @@ class Anchoring:
 
 
 def state_at_frame(seen: Observation, kinds: Sequence[Kind]) -> Float[Tensor, "batch channel"]:
-    """The state when the newest frame was taken, linear between readings; angles the short way."""
+    """The state at the newest frame, linear between readings; angles go the short way round."""
     state, readings = seen.state.float(), seen.state.shape[1]
     age_s, oldest = seen.feature_age.float().unsqueeze(1), readings - seen.state_valid.unsqueeze(1)
     # Readings that are not real have age 0.
@@ -118,3 +141,18 @@ def _vector(matrix: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3"]:
     sine = axis.square().sum(-1, keepdim=True).clamp(min=_LEAST).sqrt()
     cosine = (matrix.diagonal(dim1=-2, dim2=-1).sum(-1, keepdim=True) - 1) / 2
     return axis * (torch.atan2(sine, cosine) / sine)
+
+
+def _of_kind(values: Tensor, kinds: Sequence[Kind], *wanted: Kind) -> Tensor:
+    return values[..., [place for place, kind in enumerate(kinds) if kind in wanted]]
+
+
+def rotation_matrix(angles: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
+    """Rx(a)·Ry(b)·Rz(r) of (a, b, r) in radians."""
+    (sa, sb, sr), (ca, cb, cr) = angles.sin().unbind(-1), angles.cos().unbind(-1)
+    rows = [
+        [cb * cr, -cb * sr, sb],
+        [ca * sr + sa * sb * cr, ca * cr - sa * sb * sr, -sa * cb],
+        [sa * sr - ca * sb * cr, sa * cr + ca * sb * sr, ca * cb],
+    ]
+    return torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2)

@@ -1,4 +1,7 @@
-"""The model before the policy, when the model itself learns."""
+"""Tuning the vision-language model end to end, with the policy that `train_head` describes.
+
+`ModelFeatureSource` puts the model before the policy in the one training loop.
+"""
 
 from collections.abc import Generator, Iterable
 from contextlib import contextmanager
@@ -19,20 +22,19 @@ from pipeline.base.source import (
     tuned_on_of_store,
     write_tuned_on,
 )
-from pipeline.policy.checkpoint import DOCUMENT
-from pipeline.policy.document import PolicyDocument
+from pipeline.policy.checkpoint import DOCUMENT, PolicyDocument
 from pipeline.policy.live_policy import LivePolicy
 from pipeline.policy.policy import Policy, Trainable
 from pipeline.store import FeatureStore
-from pipeline.train.batches import BatchIndices, Windows
-from pipeline.train.feature_source import FeatureSource
-from pipeline.train.finetuning.recordings import (
+from pipeline.train.batches import BatchIndices, FeatureSource, Windows
+from pipeline.train.finetuning_rows import (
+    LiveFeed,
+    LiveRows,
     check_recordings,
     check_spec,
     find_recordings,
     known_digests,
 )
-from pipeline.train.finetuning.rows import LiveFeed, LiveRows
 from pipeline.train.process_group import ProcessGroup
 from pipeline.vlm.feature_spec import FeatureSpec, feature_spec
 from pipeline.vlm.live import LiveVLM
