@@ -23,7 +23,7 @@ from benchmarks.timing import Work, arguments, at_least, at_most, race, report
 from pipeline.base.config import TrainHeadParams, load_params
 from pipeline.policy.policy import flop_table
 from pipeline.store import Batch, FeatureStore
-from pipeline.store.gather import WIDE, Batch
+from pipeline.store.gather import WIDE
 from pipeline.train.batches import BatchIndices, FeatureSource, Prefetch, Windows
 from pipeline.train.loop import Trainer
 from pipeline.train.run import TrainingRun

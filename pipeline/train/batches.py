@@ -28,7 +28,7 @@ from pipeline.base.source import GoldenRow
 from pipeline.base.text import size
 from pipeline.policy.policy import Policy, Trainable
 from pipeline.store import Batch, FeatureStore
-from pipeline.store.gather import WIDE, Batch, Index, Late, Selection, Window
+from pipeline.store.gather import WIDE, Index, Late, Selection, Window
 from pipeline.store.mapping import fitting
 
 Ticks = NDArray[np.int64]

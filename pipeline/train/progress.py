@@ -14,7 +14,6 @@ from tqdm import tqdm
 from pipeline.base.config import TrainHeadParams
 from pipeline.base.text import duration
 from pipeline.policy.observation import PolicyShape
-from pipeline.policy.shape import PolicyShape
 from pipeline.store import FeatureStore
 from pipeline.train.batches import Prefetch
 from pipeline.train.sampling import ticks_by_source
