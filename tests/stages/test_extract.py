@@ -289,8 +289,8 @@ def test_a_plan_of_known_files_asks_its_ledger_once_and_needs_no_pandas(params_f
     code = (
         "import sys\nfrom pipeline.base.digests import ContentDigests\n"
         "from stages.command import run\nfrom stages.extract import main\n"
-        "ask, asked = ContentDigests._ask, []\n"
-        "ContentDigests._ask = lambda own, *told: [asked.append(told[0]), ask(own, *told)][1]\n"
+        "ask, asked = ContentDigests._query, []\n"
+        "ContentDigests._query = lambda own, *told: [asked.append(told[0]), ask(own, *told)][1]\n"
         "for _ in range(2):\n    asked.clear()\n"
         "    assert not run('', main, sys.argv[1:])\n"
         "print(sum(told.startswith('SELECT') for told in asked), 'pandas' in sys.modules)"
