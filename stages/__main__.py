@@ -27,26 +27,23 @@ COMMANDS = {
     "to share": ("push",),
 }
 """All commands, by what they are for."""
+_NAMES = [name for names in COMMANDS.values() for name in names]
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the named command; returns its exit code."""
-    given = list(sys.argv[1:] if arguments is None else arguments)
-    if given and given[0] in _names():
-        stage: Any = import_module(f"stages.{given[0]}")
+    words = list(sys.argv[1:] if arguments is None else arguments)
+    if words and words[0] in _NAMES:
+        stage: Any = import_module(f"stages.{words[0]}")
         shorthands = getattr(stage, "SHORTHANDS", ())
-        prog = f"{PROGRAM} {given[0]}"
-        return run(stage.__doc__, stage.main, given[1:], shorthands, stage.SECTIONS, prog)
-    options = _parser().parse_args(given)
+        prog = f"{PROGRAM} {words[0]}"
+        return run(stage.__doc__, stage.main, words[1:], shorthands, stage.SECTIONS, prog)
+    options = _parser().parse_args(words)
     if options.completion:
         print(shtab.complete(_with_all_options(), options.completion))
     else:
         _parser().print_help()
     return 0
-
-
-def _names() -> list[str]:
-    return [name for names in COMMANDS.values() for name in names]
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -63,7 +60,7 @@ def _parser() -> argparse.ArgumentParser:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--completion", choices=shtab.SUPPORTED_SHELLS, help="print the script")
-    parser.add_argument("command", nargs="?", choices=_names(), metavar="NAME")
+    parser.add_argument("command", nargs="?", choices=_NAMES, metavar="NAME")
     return parser
 
 
@@ -71,7 +68,7 @@ def _with_all_options() -> argparse.ArgumentParser:
     """The program with its commands and their options, for completion."""
     parser = argparse.ArgumentParser(PROGRAM)
     commands = parser.add_subparsers()
-    for name in _names():
+    for name in _NAMES:
         stage: Any = import_module(f"stages.{name}")
         summary = stage.__doc__.split("\n")[0]
         of_stage = parser_of(summary, getattr(stage, "SHORTHANDS", ()), stage.SECTIONS)

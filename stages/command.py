@@ -40,19 +40,19 @@ class Shorthand:
         if self.value is None:
             parser.add_argument(self.name, action="store_const", const=True, help=text)
         else:
-            left_out: dict[str, Any] = {"const": True} if self.nargs == "?" else {}
+            const = True if self.nargs == "?" else None
             parser.add_argument(
-                self.name, metavar=self.value, nargs=self.nargs, help=text, **left_out
+                self.name, metavar=self.value, nargs=self.nargs, const=const, help=text
             )
 
     def override(self, options: argparse.Namespace) -> list[str]:
         """The `section.key=value` it stands for, if it was given."""
-        given: Any = getattr(options, self.name.lstrip("-"))
-        if given is None or given == []:
+        value: Any = getattr(options, self.name.lstrip("-"))
+        if value is None or value == []:
             return []
         # A plain word stays as typed, so that 8 is a number; YAML must not interpret other text.
-        word = isinstance(given, str) and re.fullmatch(r"[\w.+-]+", given)
-        return [f"{self.key}={given if word else json.dumps(given)}"]
+        word = isinstance(value, str) and re.fullmatch(r"[\w.+-]+", value)
+        return [f"{self.key}={value if word else json.dumps(value)}"]
 
 
 def run(
@@ -98,13 +98,13 @@ def _run(
         if options.keys:
             print("\n".join(described_keys(sections or tuple(Params.model_fields))))
         else:
-            given = (pair for shorthand in shorthands for pair in shorthand.override(options))
-            params = load_params(options.params, [*options.overrides, *given])
+            short = (pair for shorthand in shorthands for pair in shorthand.override(options))
+            params = load_params(options.params, [*options.overrides, *short])
             with running_with(options.params, options.overrides):
                 work(params)
         sys.stdout.flush()  # here, where an error is handled: at the interpreter's exit it is not
     except PipelineError as error:
-        return _refuse(str(error))
+        message = str(error)
     except OSError as error:
         if isinstance(error, BrokenPipeError) and _is_unread():
             # The text that stdout still holds must not fail again when the interpreter exits.
@@ -112,8 +112,10 @@ def _run(
             return 0 if options.keys else 1  # a reader of the keys has read enough
         place = f"{error.filename}: " if error.filename else ""
         message = f"{place}{error.strerror or error}. Look at that path, then run the same again."
-        return _refuse(message)
-    return 0
+    else:
+        return 0
+    print(f"error: {message}", file=sys.stderr)
+    return 2
 
 
 @contextmanager
@@ -166,11 +168,6 @@ def parser_of(
     for shorthand in shorthands:
         shorthand.add_to(parser)
     return parser
-
-
-def _refuse(message: str) -> int:
-    print(f"error: {message}", file=sys.stderr)
-    return 2
 
 
 def _is_unread() -> bool:

@@ -1,10 +1,11 @@
 """Evaluate a trained policy on its test episodes, and compare it with simple rules.
 
 Reads what stages.train_head wrote to train_head.output, or evaluate.checkpoint if it is set. Writes
-metrics.json, tables (CSV) and a page with its pictures (report.html, PNG) into `evaluate.output`,
-and judged.json, which says what was evaluated on what. With `evaluate.modalities` it evaluates
-again with each stream ablated. The page shows frames of the best and the worst episode if their
-recordings are still below `data.root`.
+metrics.json, headline.json (what decides between policies, for `dvc metrics show`), tables (CSV)
+and a page with its pictures (report.html, PNG) into `evaluate.output`, and judged.json, which says
+what was evaluated on what. With `evaluate.modalities` it evaluates again with each stream ablated.
+The page shows frames of the best and the worst episode if their recordings are still below
+`data.root`.
 """
 
 import os

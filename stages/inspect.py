@@ -59,9 +59,9 @@ def main(params: "Params") -> None:
     for folder in (params.inspect.output, subject.folder):
         claim(folder, REPORT)
     with boxes() as notes:
-        page, *beside = write_report(subject.folder, report)
+        page, *files = write_report(subject.folder, report)
     print("\n".join([*summary(report), *notes]))
-    pictures = sum(file.suffix == ".png" for file in beside)
+    pictures = sum(file.suffix == ".png" for file in files)
     print(f"{page}: the page, with {pictures} pictures and {FINDINGS} beside it")
 
 

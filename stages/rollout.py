@@ -3,9 +3,9 @@
 Reads what stages.train_head wrote to train_head.output, or rollout.checkpoint if it is set, and the
 model of vlm.checkpoint, which must give the features that the policy was trained on. For comparison
 it also runs the demonstrator, and the policy without sensor and without features (or what
-rollout.ablations says). Writes metrics.json (success with its 95 % interval), episodes.csv (the
-policy's episodes), beside.csv (the others), settings.json and a page (report.html) into
-`rollout.output`.
+rollout.ablations says). Writes metrics.json (success with its 95 % interval), headline.json (the
+policy's success alone, for `dvc metrics show`), episodes.csv (the policy's episodes), beside.csv
+(the others), settings.json and a page (report.html) into `rollout.output`.
 
   python -m stages.rollout                                     50 episodes at level full
   python -m stages.rollout --set rollout.level=moved           the target is pushed meanwhile

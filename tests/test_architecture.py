@@ -76,7 +76,7 @@ def test_a_room_imports_only_from_rooms_below():
     tier = {name: level for level, names in enumerate(TIERS) for name in names}
     pipeline = [name for name in MODULES if name.startswith("pipeline.")]
     assert {room(name) for name in pipeline} == tier.keys()
-    for module, imported in [(one, name) for one in pipeline for name in imports(one)]:
+    for module, imported in [(user, name) for user in pipeline for name in imports(user)]:
         assert not imported.startswith("stages"), f"{module} imports {imported}"
         if imported.startswith("pipeline.") and room(imported) != room(module):
             assert tier[room(imported)] < tier[room(module)], f"{module} imports {imported}"
@@ -134,7 +134,7 @@ def has_code(path: Path) -> bool:
     )
 
 
-@pytest.mark.parametrize("stage", ["demo", "extract", "train_head", "evaluate"])
+@pytest.mark.parametrize("stage", ["demo", "extract", "train_head", "evaluate", "rollout"])
 def test_every_module_a_stage_runs_is_among_its_deps(stage):
     document = yaml.safe_load((ROOT / "dvc.yaml").read_text())["stages"][stage]
     assert f"python -m stages.{stage}" in document["cmd"]

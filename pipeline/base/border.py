@@ -30,7 +30,7 @@ _WEIGHTS = {b",": 1, b":": 8, b"[": 8, b"{": 8}
 MOST_WEIGHT = 4_000_000
 """Limit on a document's values (1 each), keys and lists (8 each). pydantic keeps a refused value
 once per problem, so a model of a dozen fields can take 1.5 GB. A tokenizer weighs 3e6."""
-_WORDS = {
+_WORDINGS = {
     "Extra inputs are not permitted": "unknown key",
     "Field required": "missing",
     "Input is not a valid path for <class 'pathlib.Path'>": "expected a path",
@@ -41,8 +41,8 @@ _WORDS = {
     "String should": "expected a text to",
     "Invalid JSON": "cannot be read as JSON",
 }
-"""pydantic's words -> our words."""
-_MOST_TOLD = 5
+"""pydantic's wording -> ours."""
+_MOST_PROBLEMS = 5
 """Problems that one message lists."""
 
 
@@ -97,7 +97,7 @@ class Border:
     ) -> T:
         """The JSON document of a text, as the model; refuses more than `most` weight."""
         raw = text.encode("utf-8", "surrogatepass") if isinstance(text, str) else text
-        weight = sum(much * raw.count(mark) for mark, much in _WEIGHTS.items())
+        weight = sum(mark_weight * raw.count(mark) for mark, mark_weight in _WEIGHTS.items())
         if weight > most:
             why = f"expected a document of weight {most:,} (a value 1, a key or a list 8)"
             raise self.refusal(where, f"{why}, found {weight:,}")
@@ -139,10 +139,10 @@ class Border:
                 mend = "Free memory, take a machine with more of it, or leave this out."
                 why = f"{what}: not enough memory for it"
                 raise Border(self.error, mend).refusal(where, why) from error
-            raised = str(error).removeprefix("Error(s) in ")  # torch's prefix for several
-            said = getattr(error, "strerror", None) or f"{type(error).__name__}: {raised}"
-            why = re.sub(r"<class '(\w+)'>", r"\1", f"{what}: {' '.join(str(said).split()):.300}")
-            raise self.refusal(where, why.encode("utf-8", "backslashreplace").decode()) from error
+            text = str(error).removeprefix("Error(s) in ")  # torch's prefix for several
+            reason = str(getattr(error, "strerror", None) or f"{type(error).__name__}: {text}")
+            why = re.sub(r"<class '(\w+)'>", r"\1", f"{what}: {' '.join(reason.split()):.300}")
+            raise self.refusal(where, _printable(why)) from error
 
 
 @contextmanager
@@ -160,16 +160,16 @@ def uncollected() -> Generator[None]:
 def _first_problems(error: ValidationError) -> str:
     """The first few problems of a model, as one line."""
     lines = [f"{place}: {what}" if place else what for place, what in problems(error)]
-    more = f"; and {len(lines) - _MOST_TOLD} more" if len(lines) > _MOST_TOLD else ""
-    return "; ".join(lines[:_MOST_TOLD]) + more
+    more = f"; and {len(lines) - _MOST_PROBLEMS} more" if len(lines) > _MOST_PROBLEMS else ""
+    return "; ".join(lines[:_MOST_PROBLEMS]) + more
 
 
 def problems(error: ValidationError) -> Iterator[tuple[str, str]]:
     """The place of each problem, such as `a.b.0`, and what was expected and found there."""
     for problem in error.errors(include_url=False, include_context=False):
         text = problem["msg"].removeprefix("Value error, ")
-        for theirs, ours in _WORDS.items():
-            text = text.replace(theirs, ours)
+        for wording, ours in _WORDINGS.items():
+            text = text.replace(wording, ours)
         if problem["type"] in ("model_type", "model_attributes_type", "dataclass_type"):
             text = "expected an object"
         if problem["type"] == "json_invalid":
@@ -193,7 +193,11 @@ _SHORT.maxlevel, _SHORT.maxstring, _SHORT.maxother = 3, 120, 120
 
 def shown(value: object) -> str:
     """A value for a message: short, with characters that every terminal can print."""
-    return _SHORT.repr(value).encode("utf-8", "backslashreplace").decode()
+    return _printable(_SHORT.repr(value))
+
+
+def _printable(text: str) -> str:
+    return text.encode("utf-8", "backslashreplace").decode()
 
 
 def named(text: str) -> str:

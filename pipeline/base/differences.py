@@ -52,10 +52,10 @@ def _short(value: Any, other: Any, most: int = 80) -> str:
     # Lists of equal length are compared by entry, so these differ in length.
     if isinstance(value, list) and any(isinstance(entry, Mapping) for entry in value):
         return f"{len(value)} entries"
-    text, beside = (json.dumps(side, ensure_ascii=False) for side in (value, other))
+    text, other_text = (json.dumps(side, ensure_ascii=False) for side in (value, other))
     if len(text) <= most:
         return text
-    same = next((at for at, (a, b) in enumerate(zip(text, beside, strict=False)) if a != b), 0)
+    same = next((at for at, (a, b) in enumerate(zip(text, other_text, strict=False)) if a != b), 0)
     begin = max(0, min(same - 25, len(text) - most))
     end = begin + most
     return f"{'…' if begin else ''}{text[begin:end]}{'…' if end < len(text) else ''}"

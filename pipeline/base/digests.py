@@ -56,30 +56,30 @@ class ContentDigests:
         """
         _refuse_foreign(ledger)
         try:
-            opened = cls(ledger, only_read=True)
-            opened._ask("DELETE FROM known WHERE 0")
-            return opened
+            digests = cls(ledger, only_read=True)
+            digests._query("DELETE FROM known WHERE 0")
+            return digests
         except (OSError, PipelineError):
-            known = cls(None)
+            digests = cls(None)
             # immutable: otherwise sqlite creates files beside it.
             place = f"file:{quote(str(ledger.absolute()))}?immutable=1"
             with (
                 suppress(sqlite3.DatabaseError),  # it only saves reads
                 closing(sqlite3.connect(place, uri=True)) as file,
             ):
-                file.backup(known._database)
-            return known
+                file.backup(digests._database)
+            return digests
 
     def _open(self) -> None:
         try:
             self._database = sqlite3.connect(self._ledger or ":memory:", isolation_level=None)
         except sqlite3.OperationalError as error:
             raise self._unusable(error, error.sqlite_errorcode) from None
-        if self._ask("PRAGMA application_id") != [(_APPLICATION,)]:
-            self._ask(f"PRAGMA application_id = {_APPLICATION}")
-        self._ask("PRAGMA journal_mode = WAL")
-        self._ask("PRAGMA synchronous = OFF")
-        self._ask(f"CREATE TABLE IF NOT EXISTS {_TABLE}")
+        if self._query("PRAGMA application_id") != [(_APPLICATION,)]:
+            self._query(f"PRAGMA application_id = {_APPLICATION}")
+        self._query("PRAGMA journal_mode = WAL")
+        self._query("PRAGMA synchronous = OFF")
+        self._query(f"CREATE TABLE IF NOT EXISTS {_TABLE}")
 
     def close(self) -> None:
         """Close the ledger."""
@@ -96,55 +96,55 @@ class ContentDigests:
             except FileNotFoundError:
                 raise _FILE.refusal(path, "no such file") from None
             folder, name = os.path.split(path)
-            what = f"{status.st_size} {status.st_mtime_ns} {_real(folder)}/{name}"
-            return self._found("file", what, lambda: file_digest(path))
+            identity = f"{status.st_size} {status.st_mtime_ns} {_real(folder)}/{name}"
+            return self._recall_or_make("file", identity, lambda: file_digest(path))
 
-    def note_rate(self, what: str, rows_per_s: float) -> None:
+    def note_rate(self, name: str, rows_per_s: float) -> None:
         """Remember how fast rows were computed, for later estimates."""
-        self._note("rate", what, str(rows_per_s))
+        self._remember("rate", name, str(rows_per_s))
 
-    def rate(self, what: str) -> float | None:
+    def rate(self, name: str) -> float | None:
         """Rows per second of the last session under that name; None if unknown."""
-        known = self._known("rate", what)
-        return None if known is None else float(known)
+        rate = self._recall("rate", name)
+        return None if rate is None else float(rate)
 
     def note_bad(self, episode: str, reason: str) -> None:
         """Remember that the episode with this digest cannot be used."""
-        self._note("bad", episode, reason)
+        self._remember("bad", episode, reason)
 
     def bad(self, episode: str) -> str | None:
         """Why the episode with this digest cannot be used; None where nothing is known."""
-        return self._known("bad", episode)
+        return self._recall("bad", episode)
 
-    def text(self, what: str, make: Callable[[], str]) -> str:
-        """The result of `make`, computed once; `what` must name all its inputs."""
-        return self._found("text", what, make)
+    def text(self, name: str, make: Callable[[], str]) -> str:
+        """The result of `make`, computed once; `name` must name all its inputs."""
+        return self._recall_or_make("text", name, make)
 
-    def _found(self, kind: str, what: str, make: Callable[[], str]) -> str:
-        known = self._known(kind, what)
-        if known is None:
-            self._note(kind, what, known := make())
-        return known
+    def _recall_or_make(self, kind: str, name: str, make: Callable[[], str]) -> str:
+        value = self._recall(kind, name)
+        if value is None:
+            self._remember(kind, name, value := make())
+        return value
 
-    def _known(self, kind: str, what: str) -> str | None:
-        key = joint_digest(kind, what)
+    def _recall(self, kind: str, name: str) -> str | None:
+        key = joint_digest(kind, name)
         text = (self._rows.get(key) or b"").decode("utf-8", "surrogateescape")
         checksum, value = text[:32], text[32:]
         return value if checksum == joint_digest(key, value) else None
 
-    def _note(self, kind: str, what: str, value: str) -> None:
-        """Remember a text under the digest of its name, with a checksum before it."""
-        key = joint_digest(kind, what)
+    def _remember(self, kind: str, name: str, value: str) -> None:
+        """Keep a value under the digest of its name, with a checksum before it."""
+        key = joint_digest(kind, name)
         text = (joint_digest(key, value) + value).encode("utf-8", "surrogateescape")
         self._rows[key] = text
-        self._ask("INSERT OR REPLACE INTO known VALUES (?, ?)", key, text)
+        self._query("INSERT OR REPLACE INTO known VALUES (?, ?)", key, text)
 
     @cached_property
     def _rows(self) -> dict[str, bytes]:
         """All entries, read at once, because a query per file would take longer than its `stat`."""
-        return dict(self._ask("SELECT key, CAST(value AS BLOB) FROM known") or ())
+        return dict(self._query("SELECT key, CAST(value AS BLOB) FROM known") or ())
 
-    def _ask(self, statement: str, *values: object) -> list[Any] | None:
+    def _query(self, statement: str, *values: object) -> list[Any] | None:
         """The result rows of a statement; None where the ledger is damaged, which is then replaced
         by an empty one (in memory if this one may only be read)."""
         try:

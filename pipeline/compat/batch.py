@@ -52,10 +52,10 @@ class UnifiedBatch(Batch):
     def inputs(self) -> dict[str, Any]:
         """The keyword arguments with which `QwenVLAUnified.forward` gives the loss."""
         streams = ("feature_age", "sensor", "sensor_valid", "state", "state_valid", "action_valid")
-        given = {name: getattr(self, name) for name in streams} | {"actions": self.action}
+        arguments = {name: getattr(self, name) for name in streams} | {"actions": self.action}
         if self.images is not None:
-            return given | {"images": self.images, "text": self.instruction}
-        return given | {"features": self.features, "slot_valid": self.slot_valid}
+            return arguments | {"images": self.images, "text": self.instruction}
+        return arguments | {"features": self.features, "slot_valid": self.slot_valid}
 
     pin_memory = Batch.pin
     """`DataLoader(pin_memory=True)` calls this."""

@@ -3,7 +3,6 @@
 A store in memory has frames instead of features, so `gather` cuts the windows of both.
 """
 
-import hashlib
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import replace
@@ -15,6 +14,7 @@ from numpy.typing import NDArray
 
 from pipeline.base.differences import describe, differences
 from pipeline.base.errors import StoreMismatch
+from pipeline.base.source import row_key
 from pipeline.data import Recording
 from pipeline.data.episode import Frames, ReadEpisode, RowFrames, common_embodiment
 from pipeline.data.recording import absolute
@@ -146,10 +146,8 @@ def first_keys(frames: RowFrames) -> NDArray[np.uint8]:
     keys = np.zeros((len(frames.frame_time), KEY_BYTES), np.uint8)
     firsts = frames.vl_start[:-1][np.diff(frames.vl_start) > 0]
     for row in firsts.tolist():
-        hasher = hashlib.blake2b(digest_size=KEY_BYTES)
-        for view, frame in sorted(read_frames(frames, np.array([row]))[row].items()):
-            hasher.update(f"{view} {frame.shape}".encode() + frame.tobytes())
-        keys[row] = np.frombuffer(hasher.digest(), np.uint8)
+        views = read_frames(frames, np.array([row]))[row]
+        keys[row] = np.frombuffer(row_key("", sorted(views), "", views), np.uint8)
     return keys
 
 

@@ -7,17 +7,17 @@ import torch
 from pipeline.base.arrays import array_of, first_non_finite, non_finite, widen
 
 
-@pytest.mark.parametrize("dtype", [np.float16, np.float32, np.float64])
-@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
-def test_the_first_bad_value_in_order(dtype, bad):
-    values = np.zeros((3, 4), dtype)
-    assert first_non_finite(values) is None
-    values[2, 1] = values[1, 3] = bad
-    assert first_non_finite(values) == (1, 3)
-    assert non_finite(values).sum() == 2
+@pytest.mark.parametrize("dtype", [np.float16, np.float32])
+def test_the_first_bad_value_in_order(dtype):
+    for bad in (np.nan, np.inf, -np.inf):
+        values = np.zeros((3, 4), dtype)
+        assert first_non_finite(values) is None
+        values[2, 1] = values[1, 3] = bad
+        assert first_non_finite(values) == (1, 3)
+        assert non_finite(values).sum() == 2
 
 
-def test_what_is_not_valid_is_not_looked_at():
+def test_invalid_entries_are_ignored():
     values = np.zeros((2, 3, 4), np.float32)
     values[0, 1] = np.nan
     valid = np.ones((2, 3), np.bool_)
@@ -26,16 +26,13 @@ def test_what_is_not_valid_is_not_looked_at():
     assert first_non_finite(values, ~valid) == (0, 1, 0)
 
 
-def test_bfloat16_goes_there_and_back():
+def test_bfloat16_goes_there_and_back_and_other_types_stay():
     numbers = torch.tensor([0.0, -1.5, 3e38, float("nan"), float("-inf")]).bfloat16()
     bits = array_of(numbers)
     assert bits.dtype == np.uint16
     np.testing.assert_array_equal(widen(bits), numbers.float().numpy())
     assert first_non_finite(bits) == (3,)
     assert non_finite(bits).tolist() == [False, False, False, True, True]
-
-
-def test_other_types_stay_as_they_are():
     values = np.arange(3, dtype=np.float16)
     assert widen(values) is values
     assert array_of(torch.ones(2)).dtype == np.float32

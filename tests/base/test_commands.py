@@ -9,10 +9,6 @@ from pipeline.base.commands import DEFAULT_PARAMS, command, running_with
 from pipeline.base.config import setting
 
 
-def test_alone_it_is_the_stage_and_its_options():
-    assert command("store", "gc", "a.zarr") == "python -m stages.store gc a.zarr"
-
-
 def test_it_repeats_params_and_settings_less_its_own():
     overrides = ["vlm.layers=[1, 2]", "extract.plan=true", "extract.store=a.zarr", "data.root=lab"]
     with running_with(Path("my params.yaml"), [*overrides, "data.root=other lab"]):
@@ -27,7 +23,7 @@ def test_default_params_are_not_repeated_nor_is_anything_afterwards():
         assert command("demo") == "python -m stages.demo --set vlm.dtype=float32"
     with pytest.raises(KeyError), running_with(Path("lab.yaml"), []):
         raise KeyError
-    assert command("demo") == "python -m stages.demo"
+    assert command("store", "gc", "a.zarr") == "python -m stages.store gc a.zarr"
 
 
 def test_what_removes_is_not_repeated_and_what_is_set_last_stands_last() -> None:

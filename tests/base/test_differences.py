@@ -34,22 +34,16 @@ def test_names_the_place_and_both_values():
     assert differences(a, b) == {"slots[1].layer": (2, 3), "views": (["View1"], ["View1", "View2"])}
 
 
-def test_what_is_absent_is_none():
+def test_what_is_absent_is_none_and_tuples_are_lists():
     assert differences({"a": {"b": 1}}, {"a": {}}) == {"a.b": (1, None)}
     assert differences({}, {"a": 1}) == {"a": (None, 1)}
+    assert not differences({"a": (1, 2)}, json.loads(json.dumps({"a": (1, 2)})))
 
 
-def test_equal_digests_are_equal_documents():
+def test_equal_digests_are_equal_documents_and_else_named_where_nothing_else_is():
     assert not differences({"spec": {"digest": "d", "x": 1}}, {"spec": {"digest": "d", "x": 2}})
-
-
-def test_the_digest_is_named_only_where_nothing_else_is():
     assert differences({"digest": "d", "x": 1}, {"digest": "e", "x": 2}) == {"x": (1, 2)}
     assert differences({"digest": "d", "x": 1}, {"digest": "e", "x": 1}) == {"digest": ("d", "e")}
-
-
-def test_tuples_are_lists():
-    assert not differences({"a": (1, 2)}, json.loads(json.dumps({"a": (1, 2)})))
 
 
 def test_long_values_are_cut_around_where_they_differ():

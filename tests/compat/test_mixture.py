@@ -32,9 +32,8 @@ class TestShares:
     @given(old=st.integers(1, 500), new=st.integers(1, 500), step=st.integers(0, 400))
     def test_are_1_to_3_within_a_draw_whatever_the_sizes(self, old, new, step):
         drawn = batches({"old": old, "new": new}, old=1.0, new=3.0)
-        of_old = sum(
-            sum(item < old for item in drawn.batch(each)) for each in range(step, step + 8)
-        )
+        steps = range(step, step + 8)
+        of_old = sum(item < old for step in steps for item in drawn.batch(step))
         assert abs(of_old - 56 / 4) <= 1 + 1e-9
         assert abs(sum(item < old for item in drawn.batch(step)) - 7 / 4) <= 1 + 1e-9
 
@@ -50,21 +49,16 @@ class TestShares:
         with pytest.raises(ConfigError, match=r"'old': 20.*'old': 0\.0"):
             batches({"old": 20}, old=0.0)
 
-    @pytest.mark.parametrize(
-        ("weights", "batch_size", "said"),
-        [
+    def test_what_cannot_be_drawn_is_refused_in_the_words_of_the_caller(self) -> None:
+        items = {"old": np.arange(3), "new": np.arange(3, 9)}
+        for weights, batch_size, message in (
             ({"old": -1.0}, 7, r"weights \{'old': -1\.0\}"),
             ({"older": 1.0}, 7, r"items \{'old': 3, 'new': 6\}, weights \{'older'"),
             ({}, 0, "batch_size from 1.*found batch_size 0"),
-        ],
-    )
-    def test_what_cannot_be_drawn_is_said_in_the_words_of_the_caller(
-        self, weights: dict[str, float], batch_size: int, said: str
-    ) -> None:
-        items = {"old": np.arange(3), "new": np.arange(3, 9)}
-        with pytest.raises(ConfigError, match=said) as refused:
-            MixtureBatches(items, weights, batch_size, seed=0)
-        assert "train_head" not in str(refused.value)
+        ):
+            with pytest.raises(ConfigError, match=message) as refused:
+                MixtureBatches(items, weights, batch_size, seed=0)
+            assert "train_head" not in str(refused.value)
 
 
 class TestResume:
@@ -114,7 +108,7 @@ class TestLoader:
                 assert batch.tick.tolist() == loader.dataset.ticks[items].tolist()
 
     def test_draws_old_and_new_recordings_1_to_3(self, loader: Any) -> None:
-        formats = [one.format for one in loader.dataset.store.episodes]
+        formats = [episode.format for episode in loader.dataset.store.episodes]
         for _, batch in zip(range(4), loader, strict=False):
             assert isinstance(batch, UnifiedBatch) and batch.images is not None
             drawn = [formats[episode] for episode in batch.episode.tolist()]
@@ -155,10 +149,3 @@ class TestLoader:
         assert len(next(iter(loader))) == 4
         with pytest.raises(ConfigError, match="recordings or a store"):
             create_unified_dataloader()
-
-    def test_real_recordings_1_to_3(self, shared_data: Path) -> None:
-        root = shared_data / "insertion"
-        loader = create_unified_dataloader([root / "old" / "*"], root / "new", batch_size=8)
-        batch = next(iter(loader))
-        old = sum(loader.dataset.episodes[i].format == "old" for i in batch.episode.tolist())
-        assert old == 2

@@ -106,11 +106,10 @@ def _cached(
     return features.to(getattr(torch, dtype)), valid
 
 
-@pytest.mark.parametrize("model_type", ["regression", "flow_matching"])
 def test_live_cached_and_mixed_give_the_same_chunk(
-    build: Make, images: list[Any], streams: dict[str, Tensor], model_type: str
+    build: Make, images: list[Any], streams: dict[str, Tensor]
 ) -> None:
-    model = build(model_type=model_type)
+    model = build(model_type="flow_matching")
     features, slot_valid = _cached(model, images)
 
     def act(*args: Any, **over: Any) -> Tensor:
@@ -149,8 +148,8 @@ def test_equal_samples_share_a_row(build: Make, images: list[Any]) -> None:
     assert isinstance(observation, LiveObservation)
     assert observation.row_of.tolist() == [0, 1, 0, 2]
     assert len(observation.rows) == 3
-    said = model.observe(images, ["insert the needle", "stop", "retract", "retract"])
-    assert said.row_of.tolist() == [0, 1, 2, 3]
+    prompts = ["insert the needle", "stop", "retract", "retract"]
+    assert model.observe(images, prompts).row_of.tolist() == [0, 1, 2, 3]
     pictures = [{view: Image.fromarray(f) for view, f in frames.items()} for frames in images]
     assert model.observe(pictures, TEXT).row_of.tolist() == [0, 1, 0, 2]
     batches: list[int] = []
@@ -168,34 +167,30 @@ def test_what_is_not_given_is_missing(build: Make, streams: dict[str, Tensor]) -
     assert model(sensor=streams["sensor"]).isfinite().all()
 
 
-def test_a_stream_without_an_encoder_is_not_looked_at(
-    build: Make, streams: dict[str, Tensor]
-) -> None:
+def test_a_stream_without_an_encoder_is_ignored(build: Make, streams: dict[str, Tensor]) -> None:
     model = build(model_type="regression", sensor_enabled=False)
     torch.testing.assert_close(model(**streams), model(state=streams["state"]))
     assert model(sensor=torch.randn(3, 2), state=streams["state"]).shape == (4, 8, 7)
-
-
-def test_a_misspelt_argument_is_refused(build: Make, streams: dict[str, Tensor]) -> None:
-    model = build()
-    for door in (model, model.observe):
-        with pytest.raises(TypeError, match="sensor_vaild"):
-            door(**streams, sensor_vaild=torch.ones(4))
-
-
-def test_nothing_to_look_at_is_refused(build: Make) -> None:
-    model, blind = build(), build(sensor_enabled=False)
-    for given in ({"images": [None, None]}, {"text": TEXT}, {"actions": torch.randn(4, 8, 7)}):
-        with pytest.raises(ObservationError, match="at least one of features, sensor, state"):
-            model(**given)
     with pytest.raises(ObservationError, match="at least one of features, state, found none"):
-        blind(sensor=torch.randn(4, 13, 9))
+        model(sensor=torch.randn(4, 13, 9))
 
 
-@pytest.mark.parametrize("to", [torch.Tensor.numpy, torch.Tensor.tolist])
-def test_validity_is_taken_as_a_store_has_it(
-    build: Make, streams: dict[str, Tensor], to: Callable[[Tensor], Any]
+def test_nothing_to_observe_and_misspelt_arguments_are_refused(
+    build: Make, streams: dict[str, Tensor]
 ) -> None:
+    model = build()
+    for arguments in ({"images": [None, None]}, {"actions": torch.randn(4, 8, 7)}):
+        with pytest.raises(ObservationError, match="at least one of features, sensor, state"):
+            model(**arguments)
+    with pytest.raises(TypeError, match="sensor_vaild"):
+        model(**streams, sensor_vaild=torch.ones(4))
+    for wrong in ({"horizont": 4}, {"lora_r": 0}, {"expert": None}):
+        with pytest.raises(ValidationError, match=next(iter(wrong))):
+            build(**wrong)
+
+
+def test_validity_is_taken_as_a_store_has_it(build: Make, streams: dict[str, Tensor]) -> None:
+    to = torch.Tensor.numpy
     model = build(model_type="regression")
     features = torch.randn(4, 3, 128)
     real = torch.tensor([[1, 0, 1], [0, 0, 0], [1, 1, 1], [0, 1, 0]])
@@ -219,11 +214,8 @@ def test_a_shape_that_does_not_fit_is_named(build: Make, streams: dict[str, Tens
     for given, message in (
         ({"features": (4, 3, 100)}, r"features: .*slot 3, dim 128\), found \(4, 3, 100"),
         ({"features": (3, 3, 128)}, r"sensor: .*batch 3, .* found \(4, 13, 9\).* that of features"),
-        ({"features": (4, 3, 128), "slot_valid": (4, 2)}, r"slot_valid: .*found \(4, 2\)"),
         ({"sensor": (4, 0, 9)}, r"sensor: .*window any, .* found \(4, 0, 9\)"),
-        ({"sensor": ()}, r"sensor: .* found \(\)"),
         ({"sensor_valid": (4, 13)}, r"sensor_valid: .*\(batch 4\), found \(4, 13\)"),
-        ({"state": (5, 25, 12)}, r"state: .*batch 4, .* found \(5, .*that of sensor"),
         ({"state_age": (4, 20)}, r"state_age: .*window 25\), found \(4, 20\)"),
         ({"actions": (4, 9, 7)}, r"actions: .*horizon 8, channel 7\), found \(4, 9, 7\)"),
         ({"actions": (4, 8, 7), "action_valid": (4, 7)}, r"action_valid: .*found \(4, 7\)"),
@@ -245,12 +237,11 @@ def test_images_text_and_streams_are_of_one_batch(
             model(some, TEXT[:3], **streams)
 
 
-@pytest.mark.parametrize("model_type", ["diffusion"])
 def test_a_fresh_model_acts_without_dropout(
-    build: Make, images: list[Any], streams: dict[str, Tensor], model_type: str
+    build: Make, images: list[Any], streams: dict[str, Tensor]
 ) -> None:
     over: dict[str, Any] = {"expert": SMALL["expert"] | {"dropout": 0.5}, "drop_sensor": 0.5}
-    model = build(model_type=model_type, finetune_vl="lora", **over).train()
+    model = build(model_type="diffusion", finetune_vl="lora", **over).train()
     model.policy.fusion.eval()
     modes: list[bool] = []
     for _ in range(2):
@@ -304,15 +295,14 @@ def _generator() -> torch.Generator:
     return torch.Generator().manual_seed(1)
 
 
-@pytest.mark.parametrize("finetune_vl", ["lora", "full"])
-def test_tuning_lowers_the_loss(build: Make, images: list[Any], finetune_vl: str) -> None:
-    model = build(model_type="regression", finetune_vl=finetune_vl, lora_dropout=0.0).train()
+def test_tuning_lowers_the_loss(build: Make, images: list[Any]) -> None:
+    model = build(model_type="regression", finetune_vl="lora", lora_dropout=0.0).train()
     # Only the vision-language model learns, and an optimizer sees it without asking for it.
     model.policy.requires_grad_(False)
     learns = [parameter for parameter in model.parameters() if parameter.requires_grad]
     assert model.vlm is not None
     assert len(learns) > 0
-    optimizer = torch.optim.AdamW(learns, lr=1e-2 if finetune_vl == "lora" else 1e-3)
+    optimizer = torch.optim.AdamW(learns, lr=1e-2)
     # The first and third sample see the same.
     actions = torch.randn(3, 8, 7)[[0, 1, 0, 2]]
     losses = []
@@ -406,20 +396,17 @@ def _live(vlm: VLMParams, views: Sequence[str] = VIEWS) -> LiveVLM:
 
 
 @pytest.mark.parametrize(
-    ("live", "views", "said"),
+    ("live", "views", "message"),
     [
         ({}, ("View1", "View3"), r'views: \["View1", "View2"\] -> \["View1", "View3"\]'),
-        ({"image_resize_width": 56}, VIEWS, r"processor.image_size: \[56, 84\] -> \[56, 56\]"),
-        ({"prompt": "{images} {instruction}"}, VIEWS, 'prompt: .* -> "{images} {instruction}"'),
-        ({"layers": (0,)}, VIEWS, r"slots\[0\].layer: 3 -> 0"),
         ({"dtype": "bfloat16"}, VIEWS, 'compute_dtype: "float32" -> "bfloat16"'),
     ],
 )
 def test_a_live_model_of_other_features_than_the_policy_s_is_refused(
-    trained: Make, demo_checkpoint: Path, live: dict[str, Any], views: tuple[str, ...], said: str
+    trained: Make, demo_checkpoint: Path, live: dict[str, Any], views: tuple[str, ...], message: str
 ) -> None:
     vlm = SEEN.model_copy(update={"checkpoint": str(demo_checkpoint), **live})
-    with pytest.raises(CheckpointMismatch, match=said):
+    with pytest.raises(CheckpointMismatch, match=message):
         QwenVLAUnified.of(trained("float32"), _live(vlm, views))
 
 
@@ -428,8 +415,9 @@ def test_a_live_model_of_other_weights_is_refused(
 ) -> None:
     other = shutil.copytree(demo_checkpoint, tmp_path / "other")
     vlm = SEEN.model_copy(update={"checkpoint": str(other)})
-    policy = trained("float32")
-    assert QwenVLAUnified.of(policy, _live(vlm)).policy is policy, "a copy elsewhere is the same"
+    policy = trained("bfloat16", variants=2)
+    # Neither the place of the weights nor how features are stored is part of what they are.
+    assert QwenVLAUnified.of(policy, _live(vlm)).policy is policy
     weights = other / "model.safetensors"
     content = bytearray(weights.read_bytes())
     content[-1] ^= 1
@@ -437,15 +425,6 @@ def test_a_live_model_of_other_weights_is_refused(
     with pytest.raises(CheckpointMismatch, match=r'weights: ".*" -> ".*"') as refused:
         QwenVLAUnified.of(policy, _live(vlm))
     assert len(str(refused.value).splitlines()) == 3, "nothing else differs"
-
-
-@pytest.mark.parametrize(("storage_dtype", "variants"), [("float16", 1), ("bfloat16", 2)])
-def test_how_features_were_stored_makes_no_live_ones_others(
-    trained: Make, demo_checkpoint: Path, storage_dtype: str, variants: int
-) -> None:
-    vlm = SEEN.model_copy(update={"checkpoint": str(demo_checkpoint)})
-    policy = trained(storage_dtype, variants=variants)
-    assert QwenVLAUnified.of(policy, _live(vlm)).policy is policy
 
 
 def test_the_arguments_it_has_always_had() -> None:
@@ -472,20 +451,10 @@ def test_the_arguments_it_has_always_had() -> None:
     assert chunk.shape == (2, 8, 7)
 
 
-def test_a_part_that_is_named_in_part_keeps_the_rest_of_it(
-    build: Make,
-) -> None:
+def test_a_part_that_is_named_in_part_keeps_the_rest_of_it(build: Make) -> None:
     params = build(expert={"dim": 32, "heads": 2}, state_encoder={"dim": 16}).policy.params
     assert (params.expert.dim, params.expert.heads, params.expert.layers) == (32, 2, 4)
     assert (params.state_encoder.dim, params.state_encoder.output_dim) == (16, 512)
-    with pytest.raises(ValidationError):
-        build(expert=None)
-
-
-def test_every_fusion(build: Make, streams: dict[str, Tensor]) -> None:
-    for fusion in ("concat", "cross_attention", "gated", "none"):
-        model = build(fusion_strategy=fusion)
-        assert model(features=torch.randn(4, 3, 128), **streams).shape == (4, 8, 7)
 
 
 @pytest.mark.parametrize(
@@ -505,13 +474,6 @@ def test_aliases_build_the_right_thing(
     assert model(sensor=torch.randn(1, 13, 9)).shape == (1, 4, 7)
     learns = any(parameter.requires_grad for parameter in model.load_vlm().parameters())
     assert learns == (finetune_vl == "full")
-
-
-def test_a_wrong_argument_is_refused(build: Make) -> None:
-    with pytest.raises(ValidationError, match="horizont"):
-        build(horizont=4)
-    with pytest.raises(ValidationError, match="lora_r"):
-        build(lora_r=0)
 
 
 def test_cached_features_need_no_transformers() -> None:

@@ -19,12 +19,6 @@ ROOT = Path(__file__).resolve().parents[2]
 PARAMS = str(ROOT / "params.yaml")
 
 
-def test_zero_when_done(capsys):
-    seen = []
-    assert run("Summary.", seen.append, ["--params", PARAMS, "--set", "data.action_hz=5"]) == 0
-    assert seen[0].data.action_hz == 5
-
-
 def test_two_and_one_message_for_what_the_user_can_mend(capfd, tmp_path):
     (tmp_path / "file").touch()
 
@@ -46,23 +40,15 @@ def test_two_and_one_message_for_what_the_user_can_mend(capfd, tmp_path):
         assert said in capfd.readouterr().err
 
 
-def test_two_for_bad_params(capsys):
-    assert run("Summary.", print, ["--params", PARAMS, "--set", "nothing.like=it"]) == 2
-    assert "nothing: unknown key; expected one of: demo, data, vlm" in capsys.readouterr().err
-
-
-def test_a_misspelt_key_is_told_which_was_meant(capsys):
-    wrong = [
-        "--set",
-        "train_head.expert.layer=2",
-        "--set",
-        'data.sources=[{"name": "a", "paths": "x"}]',
-    ]
-    assert run("Summary.", print, ["--params", PARAMS, *wrong]) == 2
-    said = capsys.readouterr().err
-    assert "train_head.expert.layer: unknown key; did you mean layers?" in said
-    assert "data.sources.0.paths: unknown key; did you mean path?" in said
-    assert "data.sources.0.path: missing" in said
+def test_two_for_bad_params_and_a_misspelt_key_is_recognised(capsys):
+    wrong = ["nothing.like=it", "train_head.expert.layer=2", "data.sources=[{name: a, paths: x}]"]
+    options = [word for override in wrong for word in ("--set", override)]
+    assert run("Summary.", print, ["--params", PARAMS, *options]) == 2
+    err = capsys.readouterr().err
+    assert "nothing: unknown key; expected one of: demo, data, vlm" in err
+    assert "train_head.expert.layer: unknown key; did you mean layers?" in err
+    assert "data.sources.0.paths: unknown key; did you mean path?" in err
+    assert "data.sources.0.path: missing" in err
 
 
 def test_an_argument_that_is_none_is_named(capsys):
@@ -81,27 +67,23 @@ SHORTHANDS = (
 def test_shorthands_stand_for_a_set(capsys):
     seen = []
     arguments = ["--params", PARAMS, "--repair", "--reextract", "8", "a b.zarr", "c,d.zarr"]
+    arguments += ["--set", "data.action_hz=5"]
     assert run("Summary.", seen.append, arguments, SHORTHANDS) == 0
     assert seen[0].verify.repair is True
     assert seen[0].verify.reextract == 8
     assert seen[0].stores.inputs == (Path("a b.zarr"), Path("c,d.zarr"))
-
-
-def test_a_shorthands_value_is_checked_as_the_key_is(capsys):
+    assert seen[0].data.action_hz == 5
     assert run("Summary.", print, ["--params", PARAMS, "--reextract", "-1"], SHORTHANDS) == 2
-    assert (
-        "verify.reextract: expected greater than or equal to 0, found -1" in capsys.readouterr().err
-    )
+    assert "verify.reextract: expected greater" in capsys.readouterr().err
 
 
 def test_keys_are_listed_with_defaults_and_meaning(capsys):
     assert run("Summary.", print, ["--keys"], sections=("verify", "train_head")) == 0
-    said = capsys.readouterr().out
-    assert "verify: What is checked in a store." in said
-    assert "  verify.reextract = 0\n      Number of random rows to compute again" in said
-    assert "  train_head.expert.dim = " in said
-    assert '  train_head.output = "models/head"\n' in said
-    assert "extract.store" not in said.replace("`extract.store`", "")
+    out = capsys.readouterr().out
+    assert "verify: What is checked in a store." in out
+    assert "  verify.reextract = 0\n      Number of random rows to compute again" in out
+    assert '  train_head.output = "models/head"\n' in out
+    assert "extract.store" not in out.replace("`extract.store`", "")
     assert run("Summary.", print, ["--keys"]) == 0
     assert "  vlm.checkpoint = (has to be given)" in capsys.readouterr().out
 
@@ -180,23 +162,26 @@ def test_one_and_a_word_when_stopped_while_it_imports(tmp_path, module, sent):
 STAGES = sorted(path.stem for path in ROOT.glob("stages/[a-z]*.py") if path.stem != "command")
 
 
-@pytest.mark.parametrize("stage", STAGES)
-def test_help_explains_each_stage_from_any_folder_at_once(stage, tmp_path):
+HELP = """
+import runpy, sys
+for stage in {stages}:
+    sys.argv = [stage, "--help"]
+    try:
+        runpy.run_module(f"stages.{{stage}}", run_name="__main__")
+    except SystemExit as ended:
+        assert ended.code == 0, stage
+"""
+
+
+def test_help_explains_each_stage_from_any_folder_at_once(tmp_path):
     """Nothing that takes seconds to import is imported for it."""
-    for heavy in ("torch", "zarr", "matplotlib", "transformers"):
-        # The working directory is the first place that `python -m` imports from.
+    for heavy in ("torch", "zarr", "matplotlib", "transformers", "pydantic", "numpy"):
+        # The working directory is the first place that `python -c` imports from.
         (tmp_path / f"{heavy}.py").write_text("raise ImportError(__name__)")
-    done = subprocess.run(
-        [sys.executable, "-m", f"stages.{stage}", "--help"],
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-        check=False,
-        env={**os.environ, "PYTHONPATH": str(ROOT)},
-    )
-    assert done.returncode == 0, done.stderr
-    assert "--set section.key=value" in done.stdout
-    assert len(done.stdout.split()) > 30
+    with (tmp_path / "help.txt").open("w") as out:
+        assert in_a_process(["-c", HELP.format(stages=STAGES)], out, tmp_path) == (0, "")
+    for text in (tmp_path / "help.txt").read_text().split("usage: ")[1:]:
+        assert "--set section.key=value" in text and len(text.split()) > 30
 
 
 @pytest.mark.parametrize("stage", STAGES)

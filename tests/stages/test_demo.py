@@ -10,7 +10,6 @@ from pipeline.simulation import demo_recordings
 from pipeline.vlm import demo_checkpoint
 from stages import command, demo
 
-Patch = pytest.MonkeyPatch
 Said = pytest.CaptureFixture[str]
 
 
@@ -49,7 +48,7 @@ def ran(params: Path) -> int:
 
 
 def test_writes_recordings_and_checkpoint(
-    params: Path, calls: list[Any], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    params: Path, calls: list[Any], tmp_path: Path, capsys: Said
 ) -> None:
     # The second time replaces the demo's own.
     for _ in range(2):
@@ -65,7 +64,7 @@ def test_stopped_while_it_writes_the_same_command_goes_on(
     params: Path,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    capsys: Said,
 ) -> None:
     def stopped(folder: Path, seed: int) -> None:
         write_weights(folder, seed)
@@ -82,13 +81,13 @@ def test_stopped_while_it_writes_the_same_command_goes_on(
 
 @pytest.mark.usefixtures("calls")
 def test_a_checkpoint_that_the_demo_did_not_write_is_left_alone(
-    params: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    params: Path, tmp_path: Path, capsys: Said
 ) -> None:
     (tmp_path / "vlm").mkdir()
     (tmp_path / "vlm" / "weights").write_text("real", encoding="utf-8")
     assert ran(params) == 2
-    said = capsys.readouterr().err
-    assert "demo.checkpoint" in said and str(tmp_path / "vlm") in said
+    err = capsys.readouterr().err
+    assert "demo.checkpoint" in err and str(tmp_path / "vlm") in err
     assert (tmp_path / "vlm" / "weights").read_text(encoding="utf-8") == "real"
     assert not (tmp_path / "recordings").exists()
 
@@ -104,7 +103,7 @@ def test_foreign_recordings_end_with_2_and_no_checkpoint(
 
 @pytest.mark.usefixtures("calls")
 def test_what_a_user_put_among_the_demos_files_is_left_alone(
-    params: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    params: Path, tmp_path: Path, capsys: Said
 ) -> None:
     assert ran(params) == 0
     (tmp_path / "vlm/model.safetensors").write_text("mine", encoding="utf-8")

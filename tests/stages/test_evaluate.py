@@ -7,7 +7,6 @@ from collections.abc import Callable
 from contextlib import redirect_stdout
 from io import StringIO
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import pytest
@@ -92,11 +91,9 @@ def test_a_store_that_grew_is_judged_on_the_same_episodes(
 
 
 @pytest.mark.parametrize(
-    ("store", "said"),
+    ("store", "message"),
     [
         ({"spec_digest": "other"}, 'feature_spec.digest: "tiny-spec" -> "other"'),
-        ({"sensor_channels": 7}, "streams.sensor.names"),
-        ({"reuse": 2}, "vlm_reuse_count: 3 -> 2"),
         ({"seed": 1}, "recordings than they were: right/episode_005"),
     ],
 )
@@ -106,15 +103,11 @@ def test_another_store_is_refused_by_name(
     tmp_path: Path,
     capsys: Said,
     store: dict[str, object],
-    said: str,
+    message: str,
 ) -> None:
-    other = tiny_store(tmp_path, name="other", **store)
-    assert (
-        run("", evaluate.main, ["--params", str(trained), "--set", f"evaluate.store={other}"]) == 2
-    )
-    error = capsys.readouterr().err
-    assert said in error
-    assert "Traceback" not in error
+    other = f"evaluate.store={tiny_store(tmp_path, name='other', **store)}"
+    assert run("", evaluate.main, ["--params", str(trained), "--set", other]) == 2
+    assert message in capsys.readouterr().err
 
 
 @pytest.mark.usefixtures("reports")
@@ -134,17 +127,22 @@ def test_a_flipped_bit_is_refused_where_it_would_be_judged_on(
     assert run("", evaluate.main, [*told, "--set", "evaluate.check_store=false"]) == 0
 
 
-def test_a_missing_checkpoint_says_what_to_run(trained: Path, tmp_path: Path, capsys: Said) -> None:
-    wanted = f"evaluate.checkpoint={tmp_path / 'nowhere'}"
-    assert run("", evaluate.main, ["--params", str(trained), "--set", wanted]) == 2
-    assert "Run stages.train_head" in capsys.readouterr().err
+def test_what_cannot_be_evaluated_says_what_to_do(
+    trained: Path, tmp_path: Path, capsys: Said
+) -> None:
+    for override, message in (
+        (f"evaluate.checkpoint={tmp_path / 'nowhere'}", "Run stages.train_head"),
+        ("evaluate.execute=9", "evaluate.execute 9: expected at most the 8 steps"),
+    ):
+        assert run("", evaluate.main, arguments(trained, tmp_path / "report", override)) == 2
+        assert message in capsys.readouterr().err
 
 
 @pytest.mark.usefixtures("reports")
 def test_without_a_checkpoint_it_judges_what_train_head_wrote(
     trained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Said
 ) -> None:
-    """And not an older head that lies where heads lie by default."""
+    """Not an older head that lies where heads lie by default."""
     shutil.copytree(trained.parent / "head", tmp_path / "models/head")
     monkeypatch.chdir(tmp_path)
     document = yaml.safe_load(trained.read_text())
@@ -199,15 +197,13 @@ def test_the_report_says_what_was_judged_and_which_streams_are_used(
 def test_the_same_judgement_is_the_same_bytes_wherever_it_is_written(
     trained: Path, judged: tuple[Path, str], tmp_path: Path
 ) -> None:
-    output = tmp_path / "else" / "where"
-    told = ["--params", str(trained), "--set", f"evaluate.output={output}"]
-    assert run("", evaluate.main, told) == 0
+    output = f"evaluate.output={tmp_path / 'else' / 'where'}"
+    assert run("", evaluate.main, ["--params", str(trained), "--set", output]) == 0
     first, second = (
         {file.name: file.read_bytes() for file in folder.iterdir()}
-        for folder in (judged[0], output)
+        for folder in (judged[0], tmp_path / "else" / "where")
     )
-    assert first == second
-    assert "report.html" in first
+    assert first == second and "report.html" in first
 
 
 def test_a_report_says_that_the_logs_are_gone(
@@ -261,39 +257,22 @@ def test_a_sampling_policy_is_judged_on_one_sample(trained: Path, tmp_path: Path
     assert many["samples"]["best_of_n"]["value"] < error
 
 
-@pytest.mark.usefixtures("reports")
-def test_more_steps_than_a_chunk_has_are_not_executed(
-    trained: Path, tmp_path: Path, capsys: Said
-) -> None:
-    told = arguments(trained, tmp_path / "report", "evaluate.execute=9")
-    assert run("", evaluate.main, told) == 2
-    assert "evaluate.execute 9: expected at most the 8 steps" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize(
-    ("environment", "checkpoint", "linked"),
-    [("phantom", "null", True), ("phantom", "models/another", False)],
-)
 def test_the_rollouts_of_this_policy_are_linked_though_they_come_later(
-    trained: Path,
-    tmp_path: Path,
-    reports: list[Report],
-    environment: str,
-    checkpoint: str,
-    linked: bool,
+    trained: Path, tmp_path: Path, reports: list[Report]
 ) -> None:
-    rollout = {"environment": environment, "checkpoint": checkpoint, "output": tmp_path / "rollout"}
-    overrides = [f"rollout.{key}={value}" for key, value in rollout.items()]
-    told = arguments(trained, tmp_path / "report", *overrides)
-    assert run("", evaluate.main, told) == 0
-    pages = {text.page for text in reports[0].blocks(Text)} - {""}
-    assert pages == ({"../rollout/report.html"} if linked else set())
+    for checkpoint in ("null", "models/another"):
+        rollout = {
+            "environment": "phantom",
+            "checkpoint": checkpoint,
+            "output": tmp_path / "rollout",
+        }
+        overrides = [f"rollout.{key}={value}" for key, value in rollout.items()]
+        assert run("", evaluate.main, arguments(trained, tmp_path / "report", *overrides)) == 0
+    pages = [{text.page for text in report.blocks(Text)} - {""} for report in reports]
+    assert pages == [{"../rollout/report.html"}, set()]
 
 
-@pytest.mark.parametrize("stage", [train_head, evaluate])
-def test_an_archive_has_to_be_restored_first(
-    stage: ModuleType, trained: Path, tmp_path: Path, capsys: Said
-) -> None:
+def test_an_archive_has_to_be_restored_first(trained: Path, tmp_path: Path, capsys: Said) -> None:
     packed = tmp_path / "tiny.archive.zarr"
     archive(trained.parent / "tiny.zarr", packed, level=1, threads=1)
     told = arguments(trained, tmp_path / "report", f"extract.store={packed}")

@@ -134,10 +134,3 @@ def test_a_damaged_store_is_refused(
     assert "stages.verify" in error
     assert not (params.parent / "report" / "metrics.json").exists()
     assert run("", probe.main, arguments) == 0
-
-
-def test_the_help_names_what_is_most_often_changed(capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit):
-        run(probe.__doc__ or "", probe.main, ["--help"])
-    said = capsys.readouterr().out
-    assert all(key in said for key in ("probe.max_ticks", "probe.folds", "probe.output"))

@@ -72,24 +72,15 @@ def observe_phantom() -> dict[str, Any]:
     return robot.reset(seed=3)[0] | {"prompt": "Insert"}
 
 
-@pytest.mark.parametrize(
-    ("changed", "said"),
-    [
-        (["serve.checkpoint=nowhere"], "expected a checkpoint"),
-        (["serve.host=0.0.0.0"], "serve.host: 0.0.0.0 can be reached by other machines"),
-        (["serve.token_file=nowhere.txt"], "serve.token_file: nowhere.txt: expected a token"),
-        (["vlm.image_resize_width=112"], "the policy was trained on other features"),
-    ],
-)
 def test_what_cannot_be_served_is_refused_by_name(
-    trained: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-    changed: list[str],
-    said: str,
+    trained: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.delenv("VLA_SERVE_TOKEN", raising=False)
-    arguments = [part for line in changed for part in ("--set", line)]
-    assert run("", serve.main, ["--params", str(trained), *arguments]) == 2
-    error = capsys.readouterr().err
-    assert said in error and "Traceback" not in error
+    for override, message in (
+        ("serve.checkpoint=nowhere", "expected a checkpoint"),
+        ("serve.host=0.0.0.0", "serve.host: 0.0.0.0 can be reached by other machines"),
+        ("serve.token_file=nowhere.txt", "serve.token_file: nowhere.txt: expected a token"),
+        ("vlm.image_resize_width=112", "the policy was trained on other features"),
+    ):
+        assert run("", serve.main, ["--params", str(trained), "--set", override]) == 2
+        assert message in capsys.readouterr().err

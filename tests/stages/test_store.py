@@ -135,15 +135,9 @@ def test_gc_lists_and_removes_only_when_told_to(
     assert command(params, "gc", str(stores / "two.zarr.part"), "--remove", *elsewhere) == 0
     assert f"removed: {stores}/two.zarr.part" in capsys.readouterr().out
     assert os.listdir(stores) == ["one.zarr"]
+    assert command(params) == 0, "lists"
+    captured = capsys.readouterr()
+    assert "one.zarr" in captured.out and captured.err == "", "progress is silent"
     assert FeatureStore.open(stores / "one.zarr").ticks == 180
     assert command(params, "gc", "--remove") == 0
     assert "nothing to remove" in capsys.readouterr().out
-
-
-def test_without_a_word_it_lists_and_progress_is_silent(
-    params: Path, tiny_store: Make, tmp_path: Path, capsys: Said
-) -> None:
-    tiny_store(tmp_path / "stores", name="one")
-    assert command(params) == 0
-    said = capsys.readouterr()
-    assert "one.zarr" in said.out and said.err == ""

@@ -46,25 +46,19 @@ def damage(store: Path) -> None:
     path.write_bytes(content)
 
 
-def test_a_sound_store(verified, store, capsys):
-    assert verified() == 0
-    said = capsys.readouterr()
-    assert f"{store}: checked 60 feature rows" in said.out
-    assert said.out.endswith(f"{store}: sound\n")
+def test_a_sound_store_has_nothing_to_repair(verified, store, capsys):
+    assert verified("--repair", section="extract") == 0, "null: the store of extract"
+    out = capsys.readouterr().out
+    assert f"{store}: checked 60 feature rows" in out and out.endswith(f"{store}: sound\n")
+    assert not part_path(store).exists()
 
 
-@pytest.mark.parametrize("address", ["nonsense://here", "tcp://127.0.0.1:9"])
-def test_an_address_where_no_scheduler_answers(verified, capsys, monkeypatch, address):
+def test_an_address_where_no_scheduler_answers(verified, capsys, monkeypatch):
     monkeypatch.setattr("pipeline.base.scheduler.TIMEOUT_S", 0.5)
-    assert verified("--set", f"verify.workers={address}") == 2
-    said = capsys.readouterr().err
-    assert f"verify.workers: no dask scheduler answers at {address}" in said
-    assert "dask scheduler" in said and "path" not in said
-
-
-def test_the_store_of_extract_where_none_is_named(verified, store, capsys):
-    assert verified(section="extract") == 0
-    assert f"{store}: sound" in capsys.readouterr().out
+    for address in ("nonsense://here", "tcp://127.0.0.1:9"):
+        assert verified("--set", f"verify.workers={address}") == 2
+        err = capsys.readouterr().err
+        assert f"verify.workers: no dask scheduler answers at {address}" in err
 
 
 def test_a_damaged_store_says_what_is_wrong_and_what_to_run_next(verified, store, capsys):
@@ -86,12 +80,6 @@ def test_repair_begins_a_build(verified, store, capsys):
     assert part_path(store).is_dir()
     assert verified("--repair") == 2
     assert "a repair of it has begun" in capsys.readouterr().err
-
-
-def test_there_is_nothing_to_repair(verified, store, capsys):
-    assert verified("--repair") == 0
-    assert capsys.readouterr().out.endswith(f"{store}: sound\n")
-    assert not part_path(store).exists()
 
 
 def test_a_store_that_is_not_finished(verified, store, capsys):

@@ -101,7 +101,7 @@ def _default(field: FieldInfo) -> str:
 
 _Section = TypeVar("_Section", bound=Section)
 
-_MOST_TOLD = 50
+_MOST_PROBLEMS = 50
 """Problems that one message lists."""
 _FILE = Border(ConfigError, "Run from the project's root, name it (--params FILE), or correct it.")
 _SET = Border(
@@ -217,7 +217,7 @@ def _as_section(document: dict[str, Any], section: type[_Section], where: str) -
         return section.model_validate(document)
     except ValidationError as error:
         lines = [f"{named(where)}: {error.error_count()} problem(s)"]
-        for place, why in islice(problems(error), _MOST_TOLD):
+        for place, why in islice(problems(error), _MOST_PROBLEMS):
             if why.startswith("unknown key"):
                 why = _REPLACED.get(place) or _unknown_key(place.split("."), section)
             lines.append(f"  {place or section.__name__.lower()}: {why}")

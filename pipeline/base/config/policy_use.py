@@ -45,9 +45,9 @@ class EvaluateParams(Section):
     checksum; false skips this, where it takes too long."""
 
 
-def latencies_ms(given: float | Sequence[float]) -> tuple[float, ...]:
+def latencies_ms(latency: float | Sequence[float]) -> tuple[float, ...]:
     """Each latency of `rollout.latency_ms` once, in the given order."""
-    return tuple(dict.fromkeys(given if isinstance(given, Sequence) else (given,)))
+    return tuple(dict.fromkeys(latency if isinstance(latency, Sequence) else (latency,)))
 
 
 class RolloutParams(Section):

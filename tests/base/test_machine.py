@@ -1,13 +1,16 @@
-"""The memory that counts is the machine's, or what a container leaves of it."""
+"""The memory of a process is the machine's or its container's; devices go by name."""
 
 import mmap
 import os
 from pathlib import Path
 
 import pytest
+import torch
 
-from pipeline.base.machine import available_bytes, memory_bytes
+from pipeline.base.errors import ConfigError
+from pipeline.base.machine import available_bytes, memory_bytes, resolve_device, use_bfloat16
 
+CPU, CUDA = torch.device("cpu"), torch.device("cuda")
 PAGE = mmap.PAGESIZE
 GIB = 2**30
 
@@ -53,3 +56,25 @@ def test_the_least_limit_of_the_groups_above_counts(machine, limited):
     assert available_bytes(machine) == 2
     limit(groups / limited, 8 * GIB, 9 * GIB, 2)
     assert available_bytes(machine) == 0
+
+
+@pytest.mark.parametrize(
+    ("amp", "device", "supported", "expected"),
+    [
+        ("auto", CPU, True, False),
+        ("auto", CUDA, True, True),
+        ("auto", CUDA, False, False),
+        ("off", CUDA, True, False),
+        ("bfloat16", CPU, False, True),
+    ],
+)
+def test_when_the_forward_pass_runs_in_bfloat16(
+    monkeypatch: pytest.MonkeyPatch, amp, device: torch.device, supported: bool, expected: bool
+) -> None:
+    monkeypatch.setattr(torch.cuda, "is_bf16_supported", lambda including_emulation: supported)
+    assert use_bfloat16(amp, device) is expected
+
+
+def test_a_device_that_is_not_there_is_an_error_that_says_who_knows_more() -> None:
+    with pytest.raises(ConfigError, match=r"device: cuda:77: .*python -m stages\.doctor says"):
+        resolve_device("cuda:77")
