@@ -166,7 +166,9 @@ def _foreign(path: Path) -> str:
 
     Zarr v3 groups, such as this project's stores, are skipped.
     """
-    names = {path.name.lower()} if path.exists() else set[str]()
+    if not os.path.exists(path):  # noqa: PTH110, it accepts a name that is too long
+        return ""
+    names = {path.name.lower()}
     for _, below, files in islice(os.walk(path), _MOST_LOOKED_AT):
         if "zarr.json" in files:
             below.clear()

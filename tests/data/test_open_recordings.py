@@ -8,7 +8,7 @@ import pytest
 
 from pipeline.base.config import Source
 from pipeline.base.errors import RecordingError
-from pipeline.data import BadEpisode, open_recordings
+from pipeline.data import BadEpisode, content_digest, open_recordings
 
 
 @pytest.fixture
@@ -35,24 +35,18 @@ SET = ["episode_000000", "episode_000001", "episode_000002"]
 
 
 @pytest.mark.parametrize(
-    ("paths", "found"),
+    ("paths", "ids"),
     [
         (["raw/Blue_point/e9"], ["e9"]),
         (["raw/Blue_point"], ["e9", "e10"]),
-        (["raw/*/e9"], ["Blue_point/e9", "Red_point/e9"]),
         (["raw/**/e10"], ["e10"]),
-        (["raw/**"], ["Blue_point/e9", "e10", "Red_point/e9"]),
-        (["raw/*/*", "raw", "raw/Blue_point/**"], ["Blue_point/e9", "e10", "Red_point/e9"]),
-        (["sets/banana"], SET),
+        (["raw/*/*", "raw", "raw/Blue_point/**"], RAW),
         (["sets/*", "new"], ["episode_1", *SET]),
         (["old/White/recv_all_?"], ["recv_all_1"]),
     ],
 )
-def test_paths_globs_and_lists_find_episodes_once_in_natural_order(root, paths, found):
-    ids = names(root, *paths)
-    assert sorted(ids) == sorted(found)
-    if "e10" in ids and "Blue_point/e9" in ids:
-        assert ids.index("Blue_point/e9") < ids.index("e10")
+def test_paths_globs_and_lists_find_episodes_once_in_natural_order(root, paths, ids):
+    assert names(root, *paths) == ids
 
 
 def test_a_whole_tree_holds_all_formats(root):
@@ -90,16 +84,12 @@ def test_ids_of_twins_take_their_parents_names(root, write):
 @pytest.mark.parametrize("format", ["raw", "new", "old", "lerobot"])
 def test_an_explicit_format_is_taken_or_refused(root, format):
     folder = {"lerobot": "sets"}.get(format, format)
+    if format == "raw":  # a file of another format beside its own changes nothing
+        (root / "raw/Red_point/e9/metadata.json").write_text("{}")
     assert names(root, folder, format=format)
     other = "new" if format != "new" else "raw"
     with pytest.raises(RecordingError, match=rf"'s'.*format '{format}'.*looks like '{other}'"):
         names(root, other, format=format)
-
-
-def test_raw_beside_a_metadata_file_can_be_asked_for(root):
-    (root / "raw/Red_point/e9/metadata.json").write_text("{}")
-    opened = open_recordings([Source(name="s", path="raw/Red_point", format="raw")], root)
-    assert [r.format for r in opened.recordings] == ["raw"]
 
 
 @pytest.mark.parametrize("format", ["raw", "new"])
@@ -129,16 +119,23 @@ def test_a_root_that_is_not_there_is_named_itself(tmp_path):
         open_recordings([Source(name="raw", path="raw")], tmp_path / "nowhere")
 
 
+HUB = "hf download --repo-type dataset"
+
+
 @pytest.mark.parametrize(
     ("path", "message"),
     [
-        ("nothing/*", "'nothing/\\*' matches nothing"),
+        (("raw", "nothing/*"), rf"'nothing/\*' matches nothing.*{HUB}"),
+        ("https://hub/lerobot/pusht", rf"matches nothing.*{HUB}"),
+        ("a" * 5000, "matches nothing"),
+        ("a\0b", "matches nothing"),
         ("raw/Blue_point/e9/robot_state_x.csv", "matches nothing"),
         ("raw/Blue_point/e9/View1", "none with an episode.*metadata.json.*data.pkl.*meta/info"),
-        (("raw", "nowhere"), "'nowhere' matches nothing"),
+        ("raw/empty", r"none with an episode.*path or format$"),
     ],
 )
-def test_nothing_found_says_what_was_looked_for(root, path, message):
+def test_an_error_names_what_was_looked_for(root, path, message):
+    (root / "raw/empty").mkdir()
     with pytest.raises(RecordingError, match=f"source 's'.*{message}"):
         open_recordings([Source(name="s", path=path)], root)
 
@@ -146,68 +143,43 @@ def test_nothing_found_says_what_was_looked_for(root, path, message):
 @pytest.mark.parametrize(
     ("path", "meant"),
     [
-        ("sets/banana/data", "sets/banana, which is a LeRobot data set"),
         ("sets/banana/data/chunk-*", "sets/banana, which is a LeRobot data set"),
         ("sets/banana/datas", "sets/banana, which is a LeRobot data set"),
-        ("raw/Blue_point/e9/View1", "raw/Blue_point/e9, which is an episode ('raw')"),
         ("old/White/recv_all_1/data.pkl", "old/White/recv_all_1, which is an episode ('old')"),
     ],
 )
-def test_a_path_too_deep_is_told_what_it_lies_in(root, path, meant):
+def test_an_error_names_the_episode_around_a_path(root, path, meant):
     with pytest.raises(RecordingError) as refused:
         open_recordings([Source(name="s", path=path)], root)
     assert str(refused.value).endswith(f". Did you mean {root}/{meant}?")
 
 
-def test_a_path_that_lies_in_no_episode_is_asked_nothing(root):
-    (root / "raw" / "empty").mkdir()
-    with pytest.raises(RecordingError, match=r"path or format$"):
-        open_recordings([Source(name="s", path="raw/empty")], root)
-
-
 FOREIGN = {
     "bridge-train.tfrecord-00000-of-00001": "RLDS",
     "umi.zarr/.zgroup": "zarr replay buffer",
-    "low_dim.hdf5": "HDF5",
     "run/episode_0.H5": "HDF5",
-    "run.bag": "ROS bag",
     "run/run_0.db3": "ROS bag",
-    "run_0.mcap": "ROS bag",
     "data/chunk-000/file-000.parquet": "LeRobot without its meta/info.json",
-    "1565077733.npz": "arrays or tables",
-    "wrench.csv": "arrays or tables",
     "steps.pkl": "arrays or tables",
     "day 1/front.mp4": "images alone",
-    "day 1/0001.jpg": "images alone",
 }
 
 
 @pytest.mark.parametrize("file", FOREIGN)
-def test_a_foreign_folder_is_told_what_it_looks_like(tmp_path: Path, file: str) -> None:
+def test_an_error_names_a_foreign_format(tmp_path, file):
     path = tmp_path / "theirs" / file
     path.parent.mkdir(parents=True)
-    path.write_bytes(b"")
-    (tmp_path / "theirs" / "preview.jpg").write_bytes(b"")
-    (tmp_path / "theirs" / "README.md").write_bytes(b"")
-    with pytest.raises(RecordingError) as refused:
+    for name in (path, tmp_path / "theirs/preview.jpg", tmp_path / "theirs/README.md"):
+        name.touch()
+    with pytest.raises(RecordingError, match=rf"{FOREIGN[file]}.* does not read.*reader\.md"):
         open_recordings([Source(name="s", path="theirs")], tmp_path)
-    said = str(refused.value)
-    assert FOREIGN[file] in said and "does not read" in said
-    assert "LeRobot" in said and "docs/recipes/reader.md" in said
 
 
-def test_a_foreign_file_is_told_what_it_looks_like(tmp_path: Path) -> None:
-    (tmp_path / "demo.hdf5").write_bytes(b"")
+def test_an_error_names_a_foreign_file(tmp_path):
+    (tmp_path / "demo.hdf5").touch()
     for path in ("demo.hdf5", "*.hdf5"):
         with pytest.raises(RecordingError, match=r"HDF5.* \(demo\.hdf5\).*reader\.md$"):
             open_recordings([Source(name="s", path=path)], tmp_path)
-
-
-@pytest.mark.parametrize("place", ["lerobot/pusht", "raw/Blue_pont", "https://hub/lerobot/pusht"])
-def test_a_path_that_matches_nothing_is_told_of_the_hub_too(root, place):
-    told = r"Mend data.root or the source's path\. .*hub.*hf download --repo-type dataset"
-    with pytest.raises(RecordingError, match=told):
-        open_recordings([Source(name="s", path=place)], root)
 
 
 def test_a_name_that_is_not_utf_8_is_refused(root):
@@ -243,7 +215,7 @@ def test_the_view_filter_keeps_what_is_asked_for(root):
     assert not any("View2" in file.parts for file in kept)
 
 
-@pytest.mark.parametrize("view", ["View1_right", "top", "View5"])
+@pytest.mark.parametrize("view", ["View1_right", "top"])
 def test_a_view_that_only_one_format_has_is_known(root, view):
     opened = open_recordings([Source(name="s", path=".")], root, [view])
     assert {view} == {name for r in opened.recordings for name in r.cameras()}
@@ -260,12 +232,6 @@ def test_an_unknown_view_beside_an_unreadable_episode_is_still_refused(root):
         open_recordings([Source(name="s", path=".")], root, ["View7"])
 
 
-@pytest.mark.parametrize("pattern", ["a\0b", "a\ud800", "a" * 5000, "a/" * 300, "**/" * 3 + "x"])
-def test_a_pattern_that_no_folder_can_have_is_refused(tmp_path, pattern):
-    with pytest.raises(RecordingError, match=r"source 's': .*found .*Mend the source's path$"):
-        open_recordings([Source.model_construct(name="s", path=pattern, format="auto")], tmp_path)
-
-
 def test_folders_are_searched_once_however_deep_and_often_linked(root):
     deep = root / "raw"
     for _ in range(200):
@@ -273,3 +239,41 @@ def test_folders_are_searched_once_however_deep_and_often_linked(root):
         deep.mkdir()
         (deep.parent / "again").symlink_to(deep)
     assert len(open_recordings([Source(name="s", path="raw", format="raw")], root).recordings)
+
+
+def names_no_file(path: Path) -> None:
+    path.symlink_to("nowhere")
+
+
+SPECIAL = {
+    os.mkfifo: "a pipe, socket or device",
+    Path.mkdir: "found a folder",
+    names_no_file: "no such file",
+}
+FILES = {
+    "old": ("data.pkl", "View1/left/*.jpg"),
+    "new": ("metadata.json", "sensor_data.npz", "robot_states.npz", "images/View1/*.jpg"),
+    "raw": ("robot_state_x.csv", "sensor_data_x.npz", "View1/*.jpg"),
+}
+
+
+@pytest.mark.parametrize("make", SPECIAL)
+@pytest.mark.parametrize(
+    ("format", "file"), [(format, file) for format, files in FILES.items() for file in files]
+)
+def test_only_regular_files_are_opened(tmp_path, write, truth, only, format, file, make):
+    folder = getattr(write, format)(tmp_path / "T" / "e", truth)
+    path = sorted(folder.glob(file))[0]
+    path.unlink()
+    make(path)
+    kind = SPECIAL[make]
+    if format == "old" and file != "data.pkl":
+        kind = "is not there"  # the pickle names a path that is no file
+    with pytest.raises((RecordingError, AssertionError), match=rf"{path.name}.*{kind}"):
+        recording = only(folder)
+        recording.state(), recording.sensor(), recording.instruction
+        for camera in recording.cameras().values():
+            camera.check(range(len(camera.time)))
+    if file != "metadata.json":
+        with pytest.raises(RecordingError, match=rf"{path.name}.*{kind}"):
+            content_digest(only(folder), str)

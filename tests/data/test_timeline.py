@@ -127,16 +127,16 @@ class TestRecordedTicks:
         line = build_timeline(made, 25.0, 3, "euler_delta")
         assert (line.recorded_hz, line.fastest_hz) == (10.0, pytest.approx(50))
 
-    @pytest.mark.parametrize("unit", [1e3, 1e6, 1e9])
-    def test_refuse_clocks_that_are_not_in_seconds(self, unit):
-        time = (1.7e9 + np.arange(20) / 10) * unit
-        with pytest.raises(RecordingError, match="made: are the clocks in seconds"):
-            build_timeline(
-                Made(recorded=recorded_at(time, "absolute", None)), 10.0, 3, "euler_delta"
-            )
-
-    def test_refuse_more_than_an_episode_can_have(self):
-        recorded = recorded_at(np.append(np.arange(20) / 10, 1e12), "absolute")
+    @pytest.mark.parametrize(
+        "time",
+        [
+            (1.7e9 + np.arange(20) / 10) * 1e3,
+            (1.7e9 + np.arange(20) / 10) * 1e9,
+            np.append(np.arange(20) / 10, 1e12),  # more ticks than an episode can have
+        ],
+    )
+    def test_refuse_clocks_that_are_not_in_seconds(self, time):
+        recorded = recorded_at(time, "absolute", None)
         with pytest.raises(RecordingError, match="made: are the clocks in seconds"):
             build_timeline(Made(recorded=recorded), 25.0, 3, "euler_delta")
 
@@ -293,9 +293,8 @@ class TestPoseActions:
         with pytest.raises(ConfigError, match="action_hz"):
             build_timeline(Made(pose=self.poses(np.zeros((50, 6)))), None, 3, "rotvec")
 
-    @pytest.mark.parametrize("unit", [1e3, 1e9])
-    def test_refuses_clocks_that_are_not_in_seconds(self, unit):
-        pose = Stream(POSE, np.arange(50) * unit / 100, np.zeros((50, 6), np.float32))
+    def test_refuses_clocks_that_are_not_in_seconds(self):
+        pose = Stream(POSE, np.arange(50) * 10.0, np.zeros((50, 6), np.float32))
         with pytest.raises(RecordingError, match="made: are the clocks in seconds"):
             build_timeline(Made(pose=pose), 10.0, 3, "rotvec")
 
@@ -379,10 +378,11 @@ def test_last_at_counts_an_equal_time_as_past():
     ]
 
 
-@pytest.mark.parametrize(("told", "kept"), [(10.0, 30.0), (30.0, 10.0)])
-@pytest.mark.parametrize("action_hz", [10.0, None])
-def test_a_rate_that_contradicts_the_clock_is_refused(told, kept, action_hz):
-    time = np.arange(20) / kept
-    recording = Made(recorded=recorded_at(time, "absolute", told))
-    with pytest.raises(RecordingError, match=rf"made: .* say {told:g} Hz .*which is {kept:g} Hz"):
+@pytest.mark.parametrize(
+    ("nominal", "actual", "action_hz"), [(10.0, 30.0, 10.0), (30.0, 10.0, None)]
+)
+def test_a_rate_that_contradicts_the_clock_is_refused(nominal, actual, action_hz):
+    recording = Made(recorded=recorded_at(np.arange(20) / actual, "absolute", nominal))
+    match = rf"made: .* say {nominal:g} Hz .*which is {actual:g} Hz"
+    with pytest.raises(RecordingError, match=match):
         build_timeline(recording, action_hz, 3, "euler_delta")
