@@ -41,7 +41,7 @@ def main(params: "Params") -> None:
     from pipeline.base.errors import NumericsError, StoreIncomplete
     from pipeline.extract.reextract import reextract
     from pipeline.extract.repair import repair
-    from pipeline.store.repair_hints import mend
+    from pipeline.store.border import mend
     from pipeline.store.verification import verify
 
     if params.verify.checkpoint:

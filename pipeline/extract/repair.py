@@ -19,10 +19,9 @@ from pipeline.extract.layout import build_arrays, check_space, finish_layout, la
 from pipeline.extract.state import Say
 from pipeline.extract.survey import sound_episodes, survey
 from pipeline.store import FEATURES, StoreBuild, build_lock, part_path, read_plan, recover
-from pipeline.store.chunks import ChunkFiles, read_rows, row_checksums
+from pipeline.store.border import extract_command, gc_command
+from pipeline.store.chunks import METADATA_DIGEST, SEAL, ChunkFiles, read_rows, row_checksums
 from pipeline.store.golden import GOLDEN
-from pipeline.store.metadata import ATTRIBUTE as METADATA_DIGEST
-from pipeline.store.metadata import SEAL
 from pipeline.store.paths import (
     MERGED,
     STORE,
@@ -30,7 +29,6 @@ from pipeline.store.paths import (
     refuse_replaced,
     unfinished_plans,
 )
-from pipeline.store.repair_hints import extract_command, gc_command
 from pipeline.store.schema import CHECKSUMS, INCREMENTAL, KEYS, chunk_paths, read_specs
 from pipeline.store.verification import Verification, read_arrays
 from pipeline.store.writer import environment_runs, sync_folders

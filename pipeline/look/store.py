@@ -30,9 +30,9 @@ from pipeline.base.table import Table
 from pipeline.look.page.blocks import Block, Issues, Outline, Picture, Report, Section, Text
 from pipeline.look.page.style import GRID, PALETTE, draw_map, panels
 from pipeline.store import FEATURES, KEY_BYTES, Episode, FeatureStore, check_trailers, episode_name
+from pipeline.store.border import extract_command
 from pipeline.store.chunks import check_row_checksums
 from pipeline.store.gather import WIDE
-from pipeline.store.repair_hints import extract_command
 from pipeline.store.schema import read_spec
 from pipeline.vlm.slots import slot_name
 

@@ -3,7 +3,7 @@
 `schema` defines what is in it, `writer` builds it so that a kill loses little, `row_source` takes
 rows from an older store, `reader` maps a finished store and gathers batches from it.
 
-`Batch` is imported from `batch` on first use, because it imports torch, which is not needed to
+`Batch` is imported from `gather` on first use, because it imports torch, which is not needed to
 write, open or check a store.
 """
 
@@ -20,7 +20,7 @@ from pipeline.store.schema import FEATURES, KEY_BYTES, SCHEMA, Sizes, arrays
 from pipeline.store.writer import StoreBuild
 
 if TYPE_CHECKING:
-    from pipeline.store.batch import Batch
+    from pipeline.store.gather import Batch
 
 __all__ = [
     "FEATURES",
@@ -46,7 +46,7 @@ __all__ = [
 
 def __getattr__(name: str) -> Any:
     if name == "Batch":
-        from pipeline.store.batch import Batch
+        from pipeline.store.gather import Batch
 
         return Batch
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

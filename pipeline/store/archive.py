@@ -44,12 +44,25 @@ from pipeline.base.files import (
     remove_folder,
     sync,
 )
-from pipeline.store.border import Group, Length, StoreAttributes, store_border
-from pipeline.store.chunks import Seal, check_seal, check_trailers, read_rows, sealed_trailer
+from pipeline.store.border import (
+    Group,
+    Length,
+    StoreAttributes,
+    extract_command,
+    gc_command,
+    store_border,
+)
+from pipeline.store.chunks import (
+    METADATA_DIGEST,
+    SEAL,
+    Seal,
+    check_seal,
+    check_trailers,
+    read_rows,
+    sealed_trailer,
+)
 from pipeline.store.golden import GOLDEN, read_golden
 from pipeline.store.lock import build_lock
-from pipeline.store.metadata import ATTRIBUTE as METADATA_DIGEST
-from pipeline.store.metadata import SEAL
 from pipeline.store.paths import (
     STORE,
     group_attributes,
@@ -60,7 +73,6 @@ from pipeline.store.paths import (
     unfinished_plans,
 )
 from pipeline.store.reader import FeatureStore
-from pipeline.store.repair_hints import extract_command, gc_command
 from pipeline.store.schema import (
     ARRAY_NAMES,
     GROUPS,

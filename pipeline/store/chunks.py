@@ -5,6 +5,8 @@ SIGBUS, but here both must be errors.
 """
 
 import errno
+import hashlib
+import json
 import os
 import shutil
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
@@ -15,18 +17,20 @@ from typing import Any
 
 import google_crc32c
 import numpy as np
+import zarr
 from numpy.typing import NDArray
 from tqdm import tqdm
 
+from pipeline.base.border import shown
 from pipeline.base.errors import StoreIncomplete
 from pipeline.base.files import disk_full_named, sync
-from pipeline.store.border import store_border
-from pipeline.store.metadata import SEAL, check_metadata, note_metadata
+from pipeline.store.border import mend, store_border
 from pipeline.store.paths import group_attributes, laid_out_attributes
-from pipeline.store.repair_hints import mend
 from pipeline.store.schema import (
+    ARRAY_NAMES,
     CHECKSUMS,
     FEATURES,
+    GROUPS,
     TRAILER_BYTES,
     ArraySpec,
     chunk_path,
@@ -35,8 +39,16 @@ from pipeline.store.schema import (
     read_specs,
 )
 
+METADATA_DIGEST = "metadata_digest"
+"""The root's attribute with the digest of all metadata, because an attribute has no checksum.
+
+It covers the `zarr.json` of the root (without the digest itself), of each group and of each array,
+as JSON with sorted keys. With the seal in the root, this one digest covers everything in the store.
+"""
+SEAL = "seal"
+"""The root's attribute with the trailers of each array's chunk files, in order, in hex."""
 Seal = Mapping[str, str]
-"""For each array, the trailers of its chunk files in order, in hex."""
+"""The value of `SEAL`: array -> hex digits."""
 UNSEALED = "expected a seal over metadata and chunks, found none: an earlier version wrote it"
 BLOCK_BYTES = 4 * 2**20
 """Bytes read at a time; few enough to be still in the processor's cache when they are checked."""
@@ -64,6 +76,41 @@ def check_row_checksums(
             f"{chunk_path(store, spec, bad[0] // spec.chunk_rows)}: rows {bad[0]} to {bad[-1]} of "
             f"{spec.name} do not give their checksum: the store is damaged. {mend(store)}"
         )
+
+
+def note_metadata(root: Path, attributes: Mapping[str, Any] | None = None) -> None:
+    """Write the digest into the root, with these attributes or else those that it has."""
+    kept = group_attributes(root) if attributes is None else attributes
+    digest = _metadata_digest(root, kept)
+    zarr.open_group(root, mode="r+").attrs.put({**kept, METADATA_DIGEST: digest})
+
+
+def metadata_damage(root: Path) -> str | None:
+    """What is wrong with the metadata; None where they give their digest.
+
+    Raises `StoreIncomplete` where they cannot be read.
+    """
+    attributes = group_attributes(root)
+    stored, actual = attributes.get(METADATA_DIGEST), _metadata_digest(root, attributes)
+    if stored == actual:
+        return None
+    return f"the metadata were changed: expected their digest {shown(stored)}, found {actual}"
+
+
+def check_metadata(root: Path) -> None:
+    """Raise `StoreIncomplete` where the metadata of a finished store were changed."""
+    if what := metadata_damage(root):
+        raise store_border(root).refusal(root / "zarr.json", what)
+
+
+def _metadata_digest(root: Path, attributes: Mapping[str, Any]) -> str:
+    """The digest of the metadata on disk, with these root attributes."""
+    places, border = ("", *GROUPS, *ARRAY_NAMES), store_border(root)
+    documents = {at: border.read_json(root / at / "zarr.json", dict[str, Any]) for at in places}
+    kept = {name: value for name, value in attributes.items() if name != METADATA_DIGEST}
+    documents[""]["attributes"] = kept
+    text = json.dumps(documents, sort_keys=True)
+    return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
 
 
 def trailers(root: Path, spec: ArraySpec) -> bytes:
@@ -149,7 +196,7 @@ def find_damage(root: Path, specs: Iterable[ArraySpec], seal: Seal | None = None
     own = read_spec(root, CHECKSUMS) if any(spec.name == FEATURES for spec, _ in files) else None
     for spec, chunk in tqdm(files, "checksums", unit="file", leave=False, disable=None, delay=1):
         path, sealed = chunk_path(root, spec, chunk), sealed_trailer(seal, spec.name, chunk)
-        compare = _pass
+        compare = None
         if own and spec.name == FEATURES:
             compare = partial(_compare_rows, root, own, spec, chunk)
         if damage := read_chunk(path, spec, compare, sealed).damage:
@@ -199,14 +246,10 @@ class ChunkState:
     """What was expected and found; None where the file gives its trailer."""
 
 
-def _pass(first: int, rows: NDArray[Any]) -> None:
-    """Look at no row."""
-
-
 def read_chunk(
     path: Path,
     spec: ArraySpec,
-    visit: Callable[[int, NDArray[Any]], object] = _pass,
+    visit: Callable[[int, NDArray[Any]], object] | None = None,
     sealed: bytes | None = None,
 ) -> ChunkState:
     """Read a chunk file block by block and compare it with its trailer, and with the `sealed` one.
@@ -226,8 +269,9 @@ def read_chunk(
                 block = buffer[: min(together, spec.chunk_rows - first) * spec.row_bytes]
                 got = file.readinto(block.data)
                 done, crc = done + got, google_crc32c.extend(crc, block[:got])
-                rows = block[: got // spec.row_bytes * spec.row_bytes].view(spec.dtype)
-                visit(first, rows.reshape(-1, *spec.shape[1:]))
+                if visit is not None:
+                    rows = block[: got // spec.row_bytes * spec.row_bytes].view(spec.dtype)
+                    visit(first, rows.reshape(-1, *spec.shape[1:]))
                 if got < len(block):
                     break
             done += file.readinto(trailer.data)
@@ -338,7 +382,7 @@ class ChunkFiles:
 
         A second run changes nothing. A trailer that does not match the rows is written again if the
         array is `owned`, because after a power loss a file may have its full size without its last
-        bytes. Otherwise raises `StoreIncomplete`.
+        bytes. Otherwise raises `StoreIncomplete`; the next run then lays the build out again.
         """
         sealed = self.spec.chunk_bytes + TRAILER_BYTES
         for chunk, path in enumerate(self.paths):
@@ -350,7 +394,11 @@ class ChunkFiles:
             if state.damage:
                 whole = state.bytes >= self.spec.chunk_bytes
                 if not whole or (path.stat().st_size == sealed and not self._owned):
-                    raise StoreIncomplete(f"{path}: {state.damage}. {mend(self._root)}")
+                    raise StoreIncomplete(
+                        f"{path}: {state.damage}: the disk did not keep what was written. Run the "
+                        "same command again: it writes streams, ticks and episodes anew and keeps "
+                        "the feature rows."
+                    )
                 self._write_trailer(chunk, state.crc)
             with disk_full_named(path):
                 os.fsync(self._descriptor(chunk))

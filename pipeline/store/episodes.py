@@ -93,8 +93,8 @@ def check_positions(root: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
         begin, end = edges[episodes], edges[episodes + 1] - (name == "tick/vl_row")
         for at in np.flatnonzero((low < begin) | (high > end))[:1]:
             what = f"expected positions from {begin[at]} to {end[at]} in episode {episodes[at]}"
-            found = f"{low[at]} to {high[at]}"
-            raise store_border(root).refusal(root / name, f"{what}, found {found}")
+            actual = f"{low[at]} to {high[at]}"
+            raise store_border(root).refusal(root / name, f"{what}, found {actual}")
 
 
 def read_episodes(
@@ -107,8 +107,8 @@ def read_episodes(
     source_of = arrays["episode/source"]
     if ((source_of < 0) | (source_of >= len(sources))).any():
         what = f"expected positions below {len(sources)}, the number of sources"
-        found = f"{source_of.min()} to {source_of.max()}"
-        raise store_border(root).refusal(root / "episode/source", f"{what}, found {found}")
+        actual = f"{source_of.min()} to {source_of.max()}"
+        raise store_border(root).refusal(root / "episode/source", f"{what}, found {actual}")
     edges = {stream: arrays[f"episode/{stream}_start"].tolist() for stream in STREAMS}
     return tuple(
         Episode(

@@ -23,8 +23,7 @@ from pipeline.base.files import disk_full_named, sync
 from pipeline.base.golden import row_key
 from pipeline.base.issue import Issue
 from pipeline.store.border import FrameDocument, StoreAttributes, StoredGolden, store_border
-from pipeline.store.chunks import read_rows
-from pipeline.store.metadata import check_metadata, note_metadata
+from pipeline.store.chunks import check_metadata, note_metadata, read_rows
 from pipeline.store.paths import group_attributes, laid_out_attributes
 from pipeline.store.schema import TRAILER_BYTES, ArraySpec
 

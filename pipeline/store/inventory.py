@@ -22,23 +22,21 @@ import numpy as np
 from pipeline.base.commands import command
 from pipeline.base.digests import LEDGER_SUFFIX, is_ledger
 from pipeline.base.errors import ConfigError, PipelineError, StoreIncomplete, StoreLocked
-from pipeline.base.files import HELD, OutputKind, remove_folder
+from pipeline.base.files import REPLACED, OutputKind, remove_folder
 from pipeline.base.format import size
 from pipeline.base.table import Table
 from pipeline.store.archive import ARCHIVE, is_archive, read_manifest
-from pipeline.store.border import StoreAttributes
+from pipeline.store.border import KNOWN, StoreAttributes, gc_command
 from pipeline.store.chunks import read_rows
 from pipeline.store.lock import build_lock, lock_holder
 from pipeline.store.paths import (
     ASIDE_METADATA,
     KEPT,
-    KNOWN,
     STORE,
     is_store,
     laid_out_attributes,
 )
 from pipeline.store.reader import FeatureStore
-from pipeline.store.repair_hints import gc_command
 from pipeline.store.schema import CHECKSUMS, FEATURES, ArraySpec, read_spec, read_specs
 
 Fate = Literal["unneeded", "by name", "kept"]
@@ -50,9 +48,8 @@ _KINDS = {
     ".previous": "previous",
     ".lock": "lock",
     LEDGER_SUFFIX: "ledger",
-    **dict.fromkeys((".repair.part", ".known", ".replaced", ".keeping"), "left over"),
 }
-_NAME = re.compile(r"(?P<base>.+?\.zarr)(?P<suffix>\.[a-z.]+?)?(?:-(?:\d+|wal|shm))?")
+_NAME = re.compile(r"(?P<base>.+?\.zarr)(?P<suffix>\.[a-z.]+?)?(?:-(?:wal|shm))?")
 _SPEC_ENTRIES = ("processor", "weights", "adapter", "compute_dtype", "variants", "prompt")
 
 
@@ -126,14 +123,13 @@ def fate_of(entry: StoreEntry) -> tuple[Fate, str]:
         if any(other.is_dir() for other in path.parent.glob(f"{escape(entry.base.name)}*")):
             return "kept", "content digests for a store that is there"
         return "unneeded", "content digests for a store that is not there"
-    contents = [at for at in (*path.glob("*"), *path.glob(".*/*")) if not at.is_symlink()]
-    stores = [path] if kind == "previous" else []
+    held = path if kind == "previous" else path / REPLACED  # a finished store
     try:
-        stores += filter(is_store, contents)
-        done = sum(_done(store) for store in {path, *stores} if is_store(store))
+        stores = list(filter(is_store, (path, held, *(path / KNOWN).glob("*"))))
+        done = sum(map(_done, stores))
     except PipelineError as error:
         return "by name", f"unfinished build that cannot be read: {_first_clause(str(error))}"
-    if not entry.base.exists() and any(laid_out_attributes(store).seal for store in stores):
+    if held in stores and not entry.base.exists():
         return "kept", f"the only copy of {entry.base.name}, which a killed replacement left there"
     if kind == "previous":
         return "by name", "the store before, kept until the next successful run"
@@ -168,7 +164,7 @@ def describe_kept(entries: Sequence[StoreEntry]) -> list[str]:
         fate, why = fate_of(entry)
         if fate == "by name":
             lines.append(f"{entry.path}: {why}, and {gc_command(entry.path)} removes it")
-        elif fate == "kept" and entry.kind in ("build", "previous", "left over"):
+        elif fate == "kept" and entry.kind in ("build", "previous"):
             lines.append(f"{entry.path}: {why}")
     return lines
 
@@ -298,22 +294,22 @@ def _first_clause(damage: str) -> str:
 
 
 def _is_ours(entry: StoreEntry) -> bool:
+    path = entry.path
     if entry.kind == "lock":
-        return entry.path.is_file() and entry.damage is None
-    if entry.kind == "ledger" and not entry.path.name.endswith(LEDGER_SUFFIX):
-        return entry.path.is_file()  # SQLite's own files beside the ledger
-    return is_ledger(entry.path) if entry.kind == "ledger" else _owner(entry.path) is not None
+        return path.is_file() and entry.damage is None
+    if entry.kind == "ledger":  # or one of SQLite's own files beside it
+        return is_ledger(path) if path.suffix == ".sqlite" else path.is_file()
+    return _owner(path) is not None
 
 
 def _owner(path: Path) -> OutputKind | None:
-    """The kind of a folder, None where it is not ours.
+    """The kind of folder that its marker names, or a sealed build, which has lost its marker.
 
-    The marker decides. If the folder were removed as another kind and a kill stopped that, the
-    command that expects its own kind there would refuse the rest as foreign.
+    None where this project did not write it.
     """
-    kinds = (STORE, ARCHIVE, KEPT, HELD)
-    try:
-        marked = next((kind for kind in kinds if kind.marks(path)), None)
-        return marked or next((kind for kind in kinds if kind.owns(path)), None)
-    except StoreIncomplete:  # damaged metadata of a group
-        return OutputKind(STORE.name, lambda _: True)
+    for kind in (STORE, ARCHIVE, KEPT):
+        if kind.marks(path):
+            return OutputKind(kind.name)  # looks at the marker alone: metadata may be damaged
+    with suppress(StoreIncomplete):
+        return STORE if STORE.owns(path) else None
+    return None

@@ -26,12 +26,16 @@ from pipeline.base.errors import ConfigError, StoreMismatch
 from pipeline.base.golden import spread
 from pipeline.base.source import RATE_TOLERANCE
 from pipeline.base.tuned_on import joined, of_store, store_attributes
-from pipeline.store.chunks import check_row_checksums, check_trailers, read_rows
+from pipeline.store.chunks import (
+    METADATA_DIGEST,
+    SEAL,
+    check_row_checksums,
+    check_trailers,
+    read_rows,
+)
 from pipeline.store.episodes import Episode, index_arrays
 from pipeline.store.golden import GOLDEN, GoldenFrames, read_golden
 from pipeline.store.lock import build_lock
-from pipeline.store.metadata import ATTRIBUTE as METADATA_DIGEST
-from pipeline.store.metadata import SEAL
 from pipeline.store.paths import (
     MERGED,
     Inode,
@@ -105,21 +109,21 @@ class MergedEpisodes:
         taken: list[tuple[FeatureStore, Episode]] = []
         digests: set[str] = set()
         names: dict[tuple[str, str], Path] = {}
-        for store, episode in [
-            (opened, episode) for opened in stores for episode in opened.episodes
-        ]:
-            if episode.digest in digests:
-                continue
-            digests.add(episode.digest)
-            name = _free_name(episode, store.path, names)
-            if name != episode.id:
-                print(
-                    f"{store.path}: its {episode.source}/{episode.id} is another episode than that "
-                    f"of {names[episode.source, episode.id]}, and named {episode.source}/{name}"
-                )
-            names[episode.source, name] = store.path
-            taken.append((store, episode))
-            self.episodes.append(replace(episode, id=name))
+        for store in stores:
+            for episode in store.episodes:
+                if episode.digest in digests:
+                    continue
+                digests.add(episode.digest)
+                name = _free_name(episode, store.path, names)
+                if name != episode.id:
+                    other = names[episode.source, episode.id]
+                    print(
+                        f"{store.path}: its {episode.source}/{episode.id} is another episode than "
+                        f"that of {other}, and named {episode.source}/{name}"
+                    )
+                names[episode.source, name] = store.path
+                taken.append((store, episode))
+                self.episodes.append(replace(episode, id=name))
         self.twice = sum(len(store.episodes) for store in stores) - len(self.episodes)
         self.arrays = index_arrays(self.episodes, self.sources)
         self.runs = [*self._runs(taken)]
@@ -230,8 +234,8 @@ def _checked_output(inputs: Sequence[Path], output: Path | None) -> Path:
 def _check_free(output: Path, plan: str) -> None:
     """Raise `StoreMismatch` where the output's place holds another store or build."""
     plans = {output: {read_plan(output)}, part_path(output): {*unfinished_plans(output)}}
-    for place, found in plans.items():
-        if found - {None, plan}:
+    for place, present in plans.items():
+        if present - {None, plan}:
             raise StoreMismatch(
                 f"{place}: expected nothing there, or a merge of these very stores; found another. "
                 "Choose another name with --into, or remove it."

@@ -24,7 +24,6 @@ A kill leaves:
 - a new store with `.known` or `.replaced` still in it: `recover` removes these.
 """
 
-import glob
 import os
 from itertools import count
 from pathlib import Path
@@ -45,9 +44,10 @@ from pipeline.base.files import (
     there,
     unmark,
 )
-from pipeline.store.border import Group, StoreAttributes
-from pipeline.store.repair_hints import (
+from pipeline.store.border import (
     KNOWN,
+    Group,
+    StoreAttributes,
     extract_command,
     mend,
     restore_command,
@@ -115,26 +115,16 @@ def refuse_foreign_store(target: Path) -> None:
 def recover(target: Path) -> None:
     """Complete or undo the step that a kill stopped, before anything is written.
 
-    Raises `ConfigError` where something lies there that this project did not write, or that an
-    earlier version left.
+    Raises `ConfigError` where something lies there that this project did not write.
     """
     refuse_foreign_store(target)
     part = part_path(target)
-    for suffix in ("repair.part", "keeping"):
-        if there(left := target.with_name(f"{target.name}.{suffix}")):
-            raise ConfigError(
-                f"{left}: an earlier version left it when it was stopped. If there is no {target} "
-                f"and a {left / target.name}, move that there. Remove {left} and run this again."
-            )
     if KEPT.marks(target):
         unmark(target)
     files.recover(part, target, STORE)
     remove_folder(target / KNOWN, STORE)
     if KEPT.marks(previous := previous_path(target)) and not (previous / "zarr.json").exists():
         remove_folder(previous, KEPT)  # its removal was stopped
-    for left in sorted(target.parent.glob(f"{glob.escape(target.name)}.known-*")):
-        if left.name.rpartition("-")[2].isdigit() and is_store(left):  # earlier versions left it
-            left.rename(_place_aside(part))
     for moving in part.glob(f"{KNOWN}/*/{ASIDE_METADATA}"):
         _move_build(part, moving.parent)
 
@@ -242,13 +232,13 @@ def find_attributes(root: Path) -> dict[str, Any]:
     if "schema" not in attributes:
         part = root if build else part_path(root)
         target = root.with_name(root.name.removesuffix(".part"))
-        found, then = "nothing there", f"Run {extract_command(target)}."
+        actual, then = "nothing there", f"Run {extract_command(target)}."
         if part.exists():
-            found = f"only the unfinished build {part}"
+            actual = f"only the unfinished build {part}"
         elif there(root):
-            found = f"{described(root)} and no zarr.json that says so"
+            actual = f"{described(root)} and no zarr.json that says so"
             then = f"It was left as it is: name another place, or, if it was one, {mend(root)}"
-        raise StoreIncomplete(f"{root}: no finished store, found {found}. {then}")
+        raise StoreIncomplete(f"{root}: no finished store, found {actual}. {then}")
     if attributes["schema"] != SCHEMA:
         raise StoreMismatch(
             f"{root / 'zarr.json'}: expected store schema {SCHEMA}, found "

@@ -34,8 +34,7 @@ from pipeline.store.schema import (
 )
 
 if TYPE_CHECKING:
-    from pipeline.store.batch import Batch
-    from pipeline.store.gather import Gatherer, Late, Selection
+    from pipeline.store.gather import Batch, Gatherer, Late, Selection
 
 
 def _one_thread() -> None:

@@ -248,7 +248,7 @@ def read_spec(root: Path, name: str) -> ArraySpec:
 
 _FEW = 64
 """Up to this many chunk files, an array's folder is not counted here."""
-_MOST_TOLD = 5
+_MOST_SHOWN = 5
 _CHOSEN = {FEATURES: ("float32", "float16", "uint16"), "sensor/values": ("float32", "float16")}
 """The allowed types of arrays whose type a param sets."""
 
@@ -271,7 +271,7 @@ def array_of(document: dict[str, Any], name: str, where: Path | str, border: Bor
     if 0 < rows <= min(whole, most) and rows % ROW_MULTIPLE == 0:
         spec = replace(spec, stored_chunk_rows=rows)
     if document != spec.document:
-        first = [*differences(spec.document, document).items()][:_MOST_TOLD]
+        first = [*differences(spec.document, document).items()][:_MOST_SHOWN]
         lines = [f"expected the {key} {a}, found {shown(b)}" for key, (a, b) in first]
         raise border.refusal(where, "; ".join(lines))
     return spec

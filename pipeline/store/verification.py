@@ -31,6 +31,7 @@ from pipeline.store.chunks import (
     UNSEALED,
     Seal,
     find_damage,
+    metadata_damage,
     read_chunk,
     read_rows,
     row_checksums,
@@ -38,7 +39,6 @@ from pipeline.store.chunks import (
 )
 from pipeline.store.episodes import check_index, check_positions
 from pipeline.store.golden import GOLDEN, golden_files, golden_issues
-from pipeline.store.metadata import metadata_damage
 from pipeline.store.paths import (
     KNOWN,
     STORE,

@@ -27,13 +27,14 @@ from pipeline.store.border import store_border
 from pipeline.store.chunks import (
     ChunkFiles,
     find_damage,
+    metadata_damage,
+    note_metadata,
     read_chunk,
     read_rows,
     row_checksums,
     write_seal,
 )
 from pipeline.store.golden import GoldenFrames, write_golden
-from pipeline.store.metadata import metadata_damage, note_metadata
 from pipeline.store.paths import begin_build, group_attributes, part_path, put_in_place
 from pipeline.store.schema import CHECKSUMS, FEATURES, INCREMENTAL, KEYS, ArraySpec, chunk_path
 
@@ -267,16 +268,8 @@ class StoreBuild:
                 f"{self.part}: {missing.size} feature rows are missing, the first is {missing[0]}. "
                 "Run stages.extract again; it computes what is missing."
             )
-        try:
-            for name in self.specs:
-                self.files(name).seal()
-        except StoreIncomplete:
-            if (damage := self.layout_damage()) is None:
-                raise
-            raise StoreIncomplete(
-                f"{damage}: the disk did not keep what was written. Run the same command again: it "
-                "writes streams, ticks and episodes anew and keeps the feature rows."
-            ) from None
+        for name in self.specs:
+            self.files(name).seal()
         with disk_full_named(self.part):
             noted = self._environments.noted
             write_seal(self.part, **({"environment": self._environments.ranges()} if noted else {}))

@@ -20,7 +20,7 @@ from random import Random
 
 import yaml
 
-from pipeline.store.metadata import note_metadata
+from pipeline.store.chunks import note_metadata
 from stages.command import run
 from tests.fuzz import oracle
 from tests.fuzz.corpus import ARCHIVE, HEAD, REAL, RECORDINGS, STORE, params

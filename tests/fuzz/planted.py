@@ -19,7 +19,7 @@ from pipeline.data.jpeg import JpegCamera
 from pipeline.data.raw import RawRecording
 from pipeline.policy.policy import Policy
 from pipeline.store import StoreBuild, verification
-from pipeline.store.metadata import note_metadata
+from pipeline.store.chunks import note_metadata
 from pipeline.store.paths import group_attributes
 from tests.fuzz.cases import Case
 from tests.fuzz.mutations import rewrite

@@ -1,6 +1,5 @@
 """Golden rows in a store: read back, proven, named where damaged, carried by merge and archive."""
 
-import filecmp
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -11,21 +10,19 @@ import zarr
 
 from pipeline.base.errors import StoreIncomplete
 from pipeline.base.golden import MOST_GOLDEN, row_key, spread
-from pipeline.store import FeatureStore, StoreBuild, part_path
+from pipeline.store import FeatureStore, StoreBuild
 from pipeline.store.archive import archive, restore
+from pipeline.store.chunks import write_seal
 from pipeline.store.golden import GOLDEN, GoldenFrames
 from pipeline.store.merging import merge
 from pipeline.store.schema import read_specs
 from pipeline.store.verification import verify
+from tests.store.samples import content, edit, flip
 
 
 @pytest.fixture
 def store(tiny_golden: Callable[..., Path], tmp_path: Path) -> Path:
     return tiny_golden(tmp_path)
-
-
-def files(root: Path) -> set[Path]:
-    return {path.relative_to(root) for path in root.rglob("*") if path.is_file()}
 
 
 class TestSound:
@@ -38,21 +35,17 @@ class TestSound:
             assert golden.instruction == "touch the dot"
             assert np.array_equal(golden.features, opened.array("vl/features")[row])
             assert golden.slot_valid.all()
-            assert golden.frames["View1"].shape == (6, 8, 3)
+        frame = zarr.open_group(store, mode="r")["golden/1/View1"][:]
+        assert frame.shape == (6, 8, 3)
+        assert np.array_equal(frame, opened.golden[1].frames["View1"])
+        checked = verify(store, threads=1)
+        assert checked.sound, checked.lines()
 
     def test_features_are_those_of_the_plain_frames_in_float32(self, tiny_golden, tmp_path):
         opened = FeatureStore.open(tiny_golden(tmp_path, dtype="bfloat16"))
         (golden, _), bits = opened.golden, opened.array("vl/features")[0]
         assert golden.features.dtype == np.float32
         assert np.array_equal((golden.features.view(np.uint32) >> 16).astype(np.uint16), bits)
-
-    def test_plain_zarr_reads_them(self, store):
-        frame = zarr.open_group(store, mode="r")["golden/1/View1"][:]
-        assert np.array_equal(frame, FeatureStore.open(store).golden[1].frames["View1"])
-
-    def test_the_whole_store_is_sound(self, store):
-        checked = verify(store, threads=1)
-        assert checked.sound, checked.lines()
 
     def test_an_earlier_store_has_none_and_is_sound(self, tiny_store, tmp_path):
         path = tiny_store(tmp_path)
@@ -73,42 +66,46 @@ class TestSound:
         build.close()
 
 
+def forge_prompt(store: Path) -> None:
+    attributes = zarr.open_group(store, mode="r+").attrs
+    attributes[GOLDEN] = [entry | {"prompt": "other"} for entry in attributes[GOLDEN]]
+    write_seal(store)
+
+
 class TestDamage:
     @pytest.mark.parametrize(
-        ("file", "said"),
+        ("harm", "message"),
         [
-            ("golden/1/View1/c/0/0/0", "golden/1/View1/c/0/0/0: golden frame cannot be read"),
-            ("golden/1/View1/zarr.json", "golden/1/View1/zarr.json: cannot be read as JSON"),
+            (
+                lambda store: flip(store / "golden/1/View1/c/0/0/0", 3, 6),
+                "golden/1/View1/c/0/0/0: golden frame cannot be read",
+            ),
+            (
+                lambda store: edit(store / "golden/1/View1/zarr.json", dict.clear),
+                "golden/1/View1/zarr.json: shape: missing",
+            ),
+            (
+                lambda store: (store / "golden/0/View1/c/0/0/0").unlink(),
+                "golden/0/View1/c/0/0/0: no such file",
+            ),
+            (
+                lambda store: shutil.rmtree(store / "golden/1"),
+                "golden/1/View1/zarr.json: no such file",
+            ),
+            (forge_prompt, "golden/0: golden frames and prompt of VL row 0 do not give the"),
         ],
     )
-    def test_a_flipped_bit_is_named(self, store, file, said):
-        content = bytearray((store / file).read_bytes())
-        content[3] ^= 64
-        (store / file).write_bytes(content)
-        self.assert_named(store, said)
-
-    def test_a_frame_that_is_gone_is_named(self, store):
-        (store / "golden/0/View1/c/0/0/0").unlink()
-        self.assert_named(store, "golden/0/View1/c/0/0/0: no such file")
-
-    def test_a_row_that_is_gone_is_named(self, store):
-        shutil.rmtree(store / "golden/1")
-        self.assert_named(store, "golden/1/View1/zarr.json: no such file")
-
-    def test_another_prompt_is_named(self, store, reseal):
-        group = zarr.open_group(store, mode="r+")
-        group.attrs[GOLDEN] = [{**entry, "prompt": "other"} for entry in group.attrs[GOLDEN]]
-        reseal(store)
-        self.assert_named(store, "golden/0: golden frames and prompt of VL row 0 do not give the")
-
-    def assert_named(self, store: Path, said: str) -> None:
+    def test_is_named_by_all_that_read_them(self, tiny_golden, store, tmp_path, harm, message):
+        harm(store)
         checked = verify(store, threads=1)
-        assert said in checked.lines()[0]
+        assert message in checked.lines()[0]
         assert {issue.kind for issue in checked.issues} == {"golden row"}
         with pytest.raises(StoreIncomplete, match="golden"):
             _ = FeatureStore.open(store).golden
         with pytest.raises(StoreIncomplete, match="golden"):
             archive(store, store.with_name("copy.archive.zarr"), 1, 1)
+        with pytest.raises(StoreIncomplete, match="golden"):
+            merge([store, tiny_golden(tmp_path, name="other", seed=4)], tmp_path / "both.zarr")
 
     def test_a_file_beside_them_is_strange(self, store):
         (store / "golden/7").mkdir()
@@ -125,9 +122,7 @@ class TestOtherStores:
             FeatureStore.open(store).golden[0].frames["View1"],
         )
         restore(tmp_path / "a.archive.zarr", tmp_path / "back.zarr", 1)
-        assert files(tmp_path / "back.zarr") == files(store)
-        same = filecmp.cmpfiles(store, tmp_path / "back.zarr", map(str, files(store)), False)
-        assert not same[1] and not same[2]
+        assert content(tmp_path / "back.zarr") == content(store)
         assert archive(store, tmp_path / "a.archive.zarr", 1, 1) is None, "it is there already"
 
     def test_a_damaged_golden_row_of_an_archive_is_named(self, store, tmp_path):
@@ -139,9 +134,7 @@ class TestOtherStores:
         chunk.unlink()
         with pytest.raises(StoreIncomplete, match="no such file"):
             restore(tmp_path / "a.archive.zarr", tmp_path / "back.zarr", 1)
-        assert (
-            not (tmp_path / "back.zarr").exists() and not part_path(tmp_path / "back.zarr").exists()
-        )
+        assert not list(tmp_path.glob("back.zarr*/"))
 
     def test_a_merge_takes_some_of_all(self, tiny_golden, tmp_path):
         inputs = [
@@ -164,14 +157,6 @@ class TestOtherStores:
         merge(inputs, tmp_path / "both.zarr")
         rows = [entry["row"] for entry in FeatureStore.open(tmp_path / "both.zarr").attrs[GOLDEN]]
         assert rows == [60, 67]
-
-    def test_a_merge_refuses_a_damaged_one(self, store, tiny_golden, tmp_path):
-        other = tiny_golden(tmp_path, name="other", seed=4)
-        (store / "golden/0/View1/c/0/0/0").write_bytes(b"")
-        with pytest.raises(
-            StoreIncomplete, match="golden/0/View1/c/0/0/0: golden frame cannot be read"
-        ):
-            merge([store, other], tmp_path / "both.zarr")
 
 
 def test_rows_are_spread_over_those_with_the_most_views():

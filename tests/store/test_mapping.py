@@ -10,13 +10,7 @@ import numpy as np
 import pytest
 
 from pipeline.store import mapping
-from pipeline.store.mapping import (
-    fitting,
-    map_flat,
-    populate,
-    read_at_random,
-    will_need,
-)
+from pipeline.store.mapping import fitting, map_flat, populate, read_at_random, will_need
 
 PAGE = mmap.PAGESIZE
 ROWS, CHUNK = 4096, 1024
@@ -45,14 +39,10 @@ def in_page_table(array: np.ndarray) -> int:
     return int((entries >> np.uint64(63)).sum())
 
 
-def test_files_are_one_array_that_outlives_them(mapped, values, tmp_path):
+def test_files_are_one_array_that_outlives_them_and_lives_in_a_view(mapped, values, tmp_path):
     assert np.array_equal(mapped, values)
     for path in tmp_path.iterdir():
         path.unlink()
-    assert np.array_equal(mapped, values)
-
-
-def test_a_view_keeps_the_map(mapped, values):
     tail = mapped[-5:]
     del mapped
     assert np.array_equal(tail, values[-5:])
@@ -112,7 +102,7 @@ def test_advice_covers_the_rows_and_nothing_beyond_the_map(mapped, values, monke
 
 
 def test_what_fits_is_taken_the_smallest_first():
-    arrays = {"a": 50, "b": 10, "c": 30}
-    assert fitting(arrays, 125) == ["b", "c", "a"]
-    assert fitting(arrays, 100) == ["b", "c"]
-    assert fitting(arrays, 12) == []
+    sizes = {"a": 50, "b": 10, "c": 30}
+    assert fitting(sizes, 125) == ["b", "c", "a"]
+    assert fitting(sizes, 100) == ["b", "c"]
+    assert fitting(sizes, 12) == []

@@ -17,7 +17,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipeline.base.errors import StoreIncomplete, StoreMismatch
-from pipeline.store import FeatureStore, part_path
+from pipeline.store import FeatureStore, episode_name, part_path, place
 from pipeline.store.chunks import write_seal
 from pipeline.store.schema import ARRAY_NAMES
 
@@ -33,24 +33,20 @@ def store(path) -> FeatureStore:
 
 
 class TestPlainReaders:
-    @pytest.mark.parametrize("name", ARRAY_NAMES)
-    def test_zarr_dask_and_numpy_agree_with_the_map(self, path, store, name):
-        mapped = store.array(name)
-        array = zarr.open_group(path, mode="r")[name]
-        assert isinstance(array, zarr.Array)
-        assert np.array_equal(array[:], mapped, equal_nan=True)
-        lazy = dask.array.from_zarr(str(path), component=name)
-        assert np.array_equal(lazy.compute(), mapped, equal_nan=True)
-        file = path / name / "c" / "/".join("0" * mapped.ndim)
-        flat = np.fromfile(file, mapped.dtype, mapped.size).reshape(mapped.shape)
-        assert np.array_equal(flat, mapped, equal_nan=True)
-
-    def test_every_array_is_plain_and_named(self, path):
+    def test_zarr_dask_and_numpy_agree_with_the_map(self, path, store):
         for name in ARRAY_NAMES:
-            metadata = zarr.open_array(path, path=name, mode="r").metadata.to_dict()
+            mapped = store.array(name)
+            array = zarr.open_array(path, path=name, mode="r")
+            assert np.array_equal(array[:], mapped, equal_nan=True), name
+            file = path / name / "c" / "/".join("0" * mapped.ndim)
+            flat = np.fromfile(file, mapped.dtype, mapped.size).reshape(mapped.shape)
+            assert np.array_equal(flat, mapped, equal_nan=True), name
+            metadata = array.metadata.to_dict()
             assert [codec["name"] for codec in metadata["codecs"]] == ["bytes", "crc32c"]
             assert len(metadata["dimension_names"]) == len(metadata["shape"])
             assert metadata["chunk_grid"]["configuration"]["chunk_shape"][0] % 4096 == 0
+        lazy = dask.array.from_zarr(str(path), component="sensor/values")
+        assert np.array_equal(lazy.compute(), store.array("sensor/values"))
 
     def test_bfloat16_is_its_bits_with_an_attribute(self, tiny_store, tmp_path):
         path = tiny_store(tmp_path, dtype="bfloat16")
@@ -106,7 +102,7 @@ def reference(
 
 
 class TestGather:
-    @settings(max_examples=60, deadline=None)
+    @settings(max_examples=60)
     @given(data=st.data())
     def test_equals_a_loop_over_ticks(self, store, data):
         ticks = data.draw(st.lists(st.integers(0, store.ticks - 1), min_size=1, max_size=6))
@@ -188,13 +184,7 @@ def varied(tiny_store, tmp_path_factory, request) -> FeatureStore:
 
 
 class TestVariants:
-    def test_a_batch_has_the_slots_of_one(self, varied):
-        assert varied.variants == 3
-        assert varied.feature_shape == (2, 8)
-        assert varied.array("vl/features").shape[1:] == (6, 8)
-        assert varied.gatherer.empty_batch(4, 8, 65, 100).features.shape == (4, 2, 8)
-
-    @settings(max_examples=60, deadline=None)
+    @settings(max_examples=60)
     @given(data=st.data())
     def test_each_tick_sees_the_variant_it_asks_for(self, varied, data):
         ticks = data.draw(st.lists(st.integers(0, varied.ticks - 1), max_size=9))
@@ -206,6 +196,7 @@ class TestVariants:
         if asked is not None:
             asked = asked.astype(np.int64)
         batch = varied.gather(ticks, feature_lag=lag, variants=asked)
+        assert varied.feature_shape == batch.features.shape[1:] == (2, 8)
         stored = varied.array("vl/features")
         if stored.dtype == np.uint16:
             stored = (stored.astype(np.uint32) << 16).view(np.float32)
@@ -228,14 +219,6 @@ class TestVariants:
             if name not in ("features", "slot_valid"):
                 assert torch.equal(getattr(last, name), value)
         assert not torch.equal(last.features, plain.features)
-
-    def test_buffers_are_reused(self, varied):
-        out = varied.gather([0, 1], variants=np.array([2, 2]))
-        again = varied.gather([0, 1], variants=np.array([1, 0]), out=out)
-        assert again.features.data_ptr() == out.features.data_ptr()
-        assert torch.equal(
-            again.features, varied.gather([0, 1], variants=np.array([1, 0])).features
-        )
 
     def test_refuses_a_variant_that_is_not_there(self, varied, store):
         for wrong in ([0, 3], [0, -1], [0]):
@@ -266,33 +249,34 @@ class TestOpen:
         batch = store.gather([store.ticks - 1], sensor_window=50)
         assert np.array_equal(batch.sensor[0].numpy(), array[-50:])
 
-    def test_says_what_is_missing(self, tmp_path):
+    def test_refuses_what_is_no_whole_store(self, tiny_store, tmp_path):
         with pytest.raises(StoreIncomplete, match=r"nowhere\.zarr.*stages\.extract"):
             FeatureStore.open(tmp_path / "nowhere.zarr")
-
-    def test_names_a_truncated_and_a_missing_chunk(self, tiny_store, tmp_path):
-        path = tiny_store(tmp_path)
-        chunk = path / "vl/features/c/0/0/0"
-        with chunk.open("r+b") as file:
-            file.truncate(100)
-        with pytest.raises(StoreIncomplete, match=r"vl/features/c/0/0/0.*found 100\."):
-            FeatureStore.open(path)
-        chunk.unlink()
-        with pytest.raises(StoreIncomplete, match="no such file"):
-            FeatureStore.open(path)
-
-    def test_refuses_a_build_by_its_name(self, tiny_store, tmp_path):
         path = tiny_store(tmp_path)
         build = path.rename(part_path(path))
         with pytest.raises(StoreIncomplete, match="only the unfinished build") as refused:
             FeatureStore.open(build)
         assert f"extract.store={path}." in str(refused.value)
+        build.rename(path)
+        os.truncate(path / "vl/features/c/0/0/0", 100)
+        with pytest.raises(StoreIncomplete, match=r"vl/features/c/0/0/0.*found 100\."):
+            FeatureStore.open(path)
 
     def test_refuses_another_schema(self, tiny_store, tmp_path):
         path = tiny_store(tmp_path)
         zarr.open_group(path, mode="r+").attrs["schema"] = 99
         with pytest.raises(StoreMismatch, match="99"):
             FeatureStore.open(path)
+
+    def test_a_row_is_named_by_its_episode_and_time(self, store):
+        assert episode_name(store.episodes[1]) == "right/episode_001"
+        for stream, row, name in (
+            ("tick", 30, "right/episode_001, tick 0 (at 0.000 s)"),
+            ("tick", 29, "left/episode_000, tick 29 (at 2.900 s)"),
+            ("vl", 59, "right/episode_005, VL row 9 (at 2.700 s)"),
+            ("sensor", 8, "left/episode_000, sensor reading 8 (at 0.100 s)"),
+        ):
+            assert place(store, stream, row) == name
 
 
 def gathered(store: FeatureStore, ticks: list[int], answers) -> None:
@@ -302,9 +286,7 @@ def gathered(store: FeatureStore, ticks: list[int], answers) -> None:
 
 
 class TestProcesses:
-    @pytest.mark.parametrize(
-        "method", ["fork", pytest.param("spawn", marks=pytest.mark.slow), "forkserver"]
-    )
+    @pytest.mark.parametrize("method", ["fork", pytest.param("spawn", marks=pytest.mark.slow)])
     def test_workers_gather_what_their_parent_gathers(self, path, method):
         store = FeatureStore.open(path)
         store.gather([0])
@@ -337,17 +319,24 @@ sys.exit(os.waitstatus_to_exitcode(os.wait()[1]))
         subprocess.run([sys.executable, "-c", program], check=True, env=environment, timeout=60)
 
 
+@pytest.fixture
+def asked(monkeypatch) -> list[tuple[tuple[int, ...], list[int], int]]:
+    """The rows that are asked for where no map fits in memory: shape of the array, first, count."""
+    rows_asked = []
+    monkeypatch.setattr("pipeline.store.gather.available_bytes", lambda: 0)
+    monkeypatch.setattr(
+        "pipeline.store.gather.will_need",
+        lambda array, first, rows: rows_asked.append((array.shape, first.tolist(), rows)),
+    )
+    return rows_asked
+
+
 class TestMemory:
-    def test_a_store_larger_than_memory_gives_the_same(self, path, store, monkeypatch):
-        asked = []
-        monkeypatch.setattr("pipeline.store.gather.available_bytes", lambda: 0)
-        monkeypatch.setattr(
-            "pipeline.store.gather.will_need",
-            lambda array, first, rows: asked.append((array.shape, first.tolist(), rows)),
-        )
+    def test_a_store_larger_than_memory_gives_the_same(self, path, store, asked):
+        expected = store.gather([31, 95], horizon=2, sensor_window=9, state_window=5)
+        asked.clear()
         large = FeatureStore.open(path)
         batch = large.gather([31, 95], horizon=2, sensor_window=9, state_window=5)
-        expected = store.gather([31, 95], horizon=2, sensor_window=9, state_window=5)
         for name, value in vars(expected).items():
             assert torch.equal(getattr(batch, name), value)
         ends = store.array("tick/sensor_end")[[31, 95]]
@@ -356,13 +345,7 @@ class TestMemory:
         assert (store.array("vl/features").shape, rows, 1) in asked
         assert len(asked) == 4
 
-    def test_rows_of_variants_are_asked_for_by_their_row(self, varied, monkeypatch):
-        asked = []
-        monkeypatch.setattr("pipeline.store.gather.available_bytes", lambda: 0)
-        monkeypatch.setattr(
-            "pipeline.store.gather.will_need",
-            lambda array, first, rows: asked.append((array.shape, first.tolist(), rows)),
-        )
+    def test_rows_of_variants_are_asked_for_by_their_row(self, varied, asked):
         large = FeatureStore.open(varied.path)
         large.gather([30, 60], variants=np.array([2, 1]))
         rows = varied.array("tick/vl_row")[[30, 60]].tolist()

@@ -6,8 +6,8 @@ import os
 import shutil
 import socket
 import subprocess
-import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +16,7 @@ import zarr
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from pipeline.base.errors import ConfigError, DiskFull, StoreIncomplete, StoreLocked
+from pipeline.base.errors import ConfigError, StoreIncomplete, StoreLocked
 from pipeline.store import (
     FeatureStore,
     RowSource,
@@ -40,10 +40,11 @@ from pipeline.store.paths import (
 )
 from pipeline.store.schema import FEATURES, TRAILER_BYTES, ArraySpec
 from tests.faults.killing import Killed, killed_before
-from tests.store.samples import TEXT, attributes_of, index_of
+from tests.store.samples import TEXT, attributes_of, content, index_of
 
 ROWS = 12
 SIZES = Sizes(1, 24, ROWS, 0, 0, len(TEXT), 3, 8, 1, 2, 0, 0)
+SPECS = arrays(SIZES, "float32", "float32")
 
 
 def lay_out(build: StoreBuild) -> None:
@@ -53,7 +54,7 @@ def lay_out(build: StoreBuild) -> None:
 
 
 def begun(folder: Path, plan: str = "plan") -> StoreBuild:
-    build = StoreBuild(folder / "s.zarr", arrays(SIZES, "float32", "float32"), plan)
+    build = StoreBuild(folder / "s.zarr", SPECS, plan)
     build.create()
     build.allocate()
     lay_out(build)
@@ -69,10 +70,20 @@ def rows_of(seed: int, count: int) -> np.ndarray:
     return np.random.default_rng(seed).normal(size=(count, 3, 8)).astype(np.float32)
 
 
+def kill_everywhere(begun: Path, check: Callable[[Path, int], bool], stride: int = 1) -> int:
+    """`check(a copy of begun, n)`, which kills before step n, for every n until none is left.
+
+    Returns the first n without a kill.
+    """
+    for kill_at in range(0, 200, stride):
+        folder = Path(shutil.copytree(begun, begun.with_name(str(kill_at)), symlinks=True))
+        if not check(folder, kill_at):
+            return kill_at
+    raise AssertionError("more steps than expected")
+
+
 class TestCommit:
-    @settings(
-        max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
-    )
+    @settings(max_examples=40, suppress_health_check=[HealthCheck.function_scoped_fixture])
     @given(
         batches=st.lists(
             st.lists(st.integers(0, ROWS - 1), min_size=1, max_size=5, unique=True), max_size=5
@@ -167,14 +178,15 @@ class TestSeal:
     )
     def test_a_kill_at_any_step_is_mended_by_sealing_again(self, tmp_path, replaces, steps, stride):
         """Kill before the n-th of these steps, for every n (or every 13th), until none is left."""
-        for kill_at in range(0, 200, stride):
-            folder = tmp_path / str(kill_at)
-            folder.mkdir()
-            if replaces:
-                self.full(folder, "before", seed=1).seal()
-            build = self.full(folder, "after")
-            finished = not killed_before(kill_at, build.seal, steps)
-            if not finished:
+        begun = tmp_path / "begun"
+        if replaces:
+            self.full(begun, "before", seed=1).seal()
+        self.full(begun, "after").close()
+
+        def check(folder: Path, kill_at: int) -> bool:
+            build = StoreBuild(folder / "s.zarr", SPECS, "after")
+            killed = killed_before(kill_at, build.seal, steps)
+            if killed:
                 recover(build.target)
                 if build.part.exists():
                     resumed(build).seal()
@@ -182,10 +194,9 @@ class TestSeal:
             assert np.array_equal(store.array(FEATURES), rows_of(0, ROWS))
             assert store.attrs["environment"] == [{"rows": [0, ROWS], "torch": "after"}]
             assert [path.name for path in folder.iterdir()] == ["s.zarr"]
-            if finished:
-                assert kill_at >= 4
-                return
-        raise AssertionError("sealing takes more steps than expected")
+            return killed
+
+        assert kill_everywhere(begun, check, stride) >= 4
 
     @pytest.mark.parametrize("linked", [False, True])
     def test_a_kill_while_the_old_is_kept_is_mended_by_sealing_again(self, tmp_path, linked):
@@ -193,33 +204,28 @@ class TestSeal:
         built = tmp_path / "built"
         self.full(built, "before", seed=1).seal()
         self.full(built, "after").finish()
-        for kill_at in range(30):
-            target = Path(shutil.copytree(built, tmp_path / str(kill_at))) / "s.zarr"
+
+        def check(folder: Path, kill_at: int) -> bool:
+            target, previous = folder / "s.zarr", folder / "s.zarr.previous"
             if linked:
-                target.rename(target.with_name("big"))
+                target.rename(folder / "big")
                 target.symlink_to("big")
-            finished = not killed_before(kill_at, lambda: put_in_place(target, keep=True))  # noqa: B023
+            killed = killed_before(kill_at, lambda: put_in_place(target, keep=True))
             recover(target)
             if part_path(target).exists():
                 put_in_place(target, keep=True)
-            previous = previous_path(target)
             for store, seed in ((target, 0), (previous, 1)):
                 assert np.array_equal(FeatureStore.open(store).array(FEATURES), rows_of(seed, ROWS))
             assert KEPT.owns(previous)
             assert previous.is_symlink() == linked
-            assert {path.name for path in target.parent.iterdir()} <= {
-                "s.zarr",
-                "s.zarr.previous",
-                "big",
-            }
+            assert {*os.listdir(folder)} == {"s.zarr", "s.zarr.previous", *["big"] * linked}
             assert sorted(os.listdir(target)) == sorted(os.listdir(built / "s.zarr"))
-            if finished:
-                assert kill_at >= 3
-                return
-        raise AssertionError("more steps than expected")
+            return killed
+
+        assert kill_everywhere(built, check) >= 3
 
     @pytest.mark.parametrize("link", [False, True])
-    def test_a_copy_or_link_of_the_user_is_not_the_one_that_was_kept(self, tmp_path, link):
+    def test_a_copy_or_link_of_the_user_is_not_the_kept_store(self, tmp_path, link):
         self.full(tmp_path, "before", seed=1).seal()
         self.full(tmp_path, "after").finish()
         previous = previous_path(tmp_path / "s.zarr")
@@ -238,44 +244,28 @@ class TestSeal:
         build = begun(tmp_path / "begun")
         build.commit([3], rows_of(0, 1), [bytes(16)], build.environment_index({"torch": "1"}))
         build.close()
-        for kill_at in range(30):
-            folder = Path(shutil.copytree(tmp_path / "begun", tmp_path / str(kill_at)))
+
+        def check(folder: Path, kill_at: int) -> bool:
             target = folder / "s.zarr"
-            finished = not killed_before(kill_at, lambda: set_build_aside(target))  # noqa: B023
+            killed = killed_before(kill_at, lambda: set_build_aside(target))
             recover(target)
             (known,) = filter(is_store, [part_path(target), *builds_aside(target)])
             row, environment = RowSource(known).take(bytes(16)) or (None, {})
             assert np.array_equal(row, rows_of(0, 1)[0])
             assert environment == {"torch": "1"}
             begin_build(target)
-            assert not finished or [known] == builds_aside(target)
-            if finished:
-                assert kill_at > 6
-                return
-        raise AssertionError("more steps than expected")
+            assert killed or [known] == builds_aside(target)
+            return killed
 
-    def test_a_build_that_an_earlier_version_set_aside_is_taken_over(self, tmp_path):
-        begun(tmp_path).close()
-        target = tmp_path / "s.zarr"
-        part_path(target).rename(tmp_path / "s.zarr.known-0")
-        shutil.copytree(tmp_path / "s.zarr.known-0", tmp_path / "s.zarr.known-good")
-        recover(target)
-        assert sorted(os.listdir(tmp_path)) == ["s.zarr.known-good", "s.zarr.part"]
-        assert len(builds_aside(target)) == 1
-
-    @pytest.mark.parametrize("left", ["keeping", "repair.part"])
-    def test_what_an_earlier_version_left_is_named_with_what_to_do(self, tmp_path, left):
-        (tmp_path / f"s.zarr.{left}").mkdir()
-        with pytest.raises(ConfigError, match=rf"s\.zarr\.{left}: an earlier version.*[Rr]emove"):
-            recover(tmp_path / "s.zarr")
+        assert kill_everywhere(tmp_path / "begun", check) > 6
 
     def test_a_finished_store_replaced_is_never_written(self, tmp_path):
         self.full(tmp_path, "before", seed=1).seal()
         kept = tmp_path / "kept"
         subprocess.run(["cp", "-al", tmp_path / "s.zarr", kept], check=True)
-        before = {path: path.read_bytes() for path in kept.rglob("*") if path.is_file()}
+        before = content(kept)
         self.full(tmp_path, "after").seal()
-        assert {path: path.read_bytes() for path in before} == before
+        assert content(kept) == before
 
     def test_a_store_behind_a_symbolic_link_loses_the_link_alone(self, tmp_path):
         self.full(tmp_path / "disk", "before", seed=1).seal()
@@ -285,9 +275,6 @@ class TestSeal:
         assert not (tmp_path / "s.zarr").is_symlink()
         behind = FeatureStore.open(tmp_path / "disk" / "s.zarr")
         assert np.array_equal(behind.array(FEATURES), rows_of(1, ROWS))
-        (tmp_path / "s.zarr.old").symlink_to(behind.path)  # a user's own
-        recover(tmp_path / "s.zarr")
-        assert (tmp_path / "s.zarr.old").is_symlink()
 
     @pytest.mark.parametrize("name", [FEATURES, "vl/key", "vl/checksum"])
     def test_a_trailer_that_a_power_loss_left_out_costs_no_row(self, tmp_path, name):
@@ -310,113 +297,62 @@ class TestLinks:
         build.close()
         kept = tmp_path / "kept"
         subprocess.run(["cp", "-al", build.part, kept], check=True)
-        before = {path: path.read_bytes() for path in kept.rglob("c/**/*") if path.is_file()}
+        before = content(kept / "vl")
         again = resumed(build)
         again.commit(range(5, ROWS), rows_of(1, 7), [bytes(16)] * 7, 0)
         again.seal()
         wanted = np.concatenate([rows_of(0, 5), rows_of(1, 7)])
         assert np.array_equal(FeatureStore.open(again.target).array(FEATURES), wanted)
         assert np.array_equal(zarr.open_array(again.target, path=FEATURES, mode="r")[:], wanted)
-        assert {path: path.read_bytes() for path in before} == before
+        assert content(kept / "vl") == before
 
-    @pytest.mark.parametrize("harm", [lambda path: os.truncate(path, 99), Path.unlink])
-    def test_a_chunk_that_is_not_whole_is_written_anew(self, tmp_path, monkeypatch, harm):
+    @pytest.mark.parametrize("harm", [None, lambda path: os.truncate(path, 99), Path.unlink])
+    def test_whole_unchanged_chunks_are_linked_and_others_are_written(
+        self, tmp_path, monkeypatch, harm
+    ):
         monkeypatch.setattr("pipeline.store.schema.CHUNK_BYTES", 4096)
-        build, values = self._with_sensor(tmp_path, 9000, "one")
-        build.seal()
-        harm(build.target / "sensor/values/c/0/0")
-        other, _ = self._specs(tmp_path, 9000, "two")
-        other.create()
-        spec = other.specs["sensor/values"]
-        other.link_unchanged("sensor/values", build.target, spec, 9000)
-        assert [other.files("sensor/values").is_linked(chunk) for chunk in (0, 1)] == [False, True]
-        other.allocate()
-        other.write("sensor/values", 0, values)
-        self._finish(other)
-        other.seal()
-        assert np.array_equal(FeatureStore.open(other.target).array("sensor/values"), values)
-
-    def test_unchanged_chunks_are_linked_and_others_are_not(self, tmp_path, monkeypatch):
-        monkeypatch.setattr("pipeline.store.schema.CHUNK_BYTES", 4096)
-        build, values = self._with_sensor(tmp_path, 9000, "one")
-        build.seal()
-        longer, grown = self._specs(tmp_path, 14000, "two")
-        longer.create()
-        donor = RowSource(build.target)
-        spec = donor.specs["sensor/values"]
-        assert longer.linkable("sensor/values", spec, 9000) == 2, "the last holds the stream's end"
-        longer.link_unchanged("sensor/values", build.target, spec, 9000)
-        longer.allocate()
-        grown[:9000] = values
-        longer.write("sensor/values", 0, grown)
-        inode = [path.stat().st_ino for path in longer.files("sensor/values").paths]
-        old = [
-            path.stat().st_ino for path in sorted((build.target / "sensor/values/c").glob("*/0"))
-        ]
-        assert inode[:2] == old[:2]
-        assert inode[2] != old[2]
-        self._finish(longer)
+        name, target = "sensor/values", tmp_path / "s.zarr"
+        values = np.random.default_rng(0).normal(size=(14_000, 3)).astype(np.float32)
+        self.build(target, values[:9000]).seal()
+        (first, second, _) = (target / name / "c" / str(chunk) / "0" for chunk in range(3))
+        inodes = [path.stat().st_ino for path in (first, second)]
+        if harm is not None:
+            harm(first)
+        longer = self.build(target, values, RowSource(target).specs[name])
+        linked = [longer.files(name).is_linked(chunk) for chunk in range(4)]
+        assert linked == [harm is None, True, False, False], "the third holds the stream's end"
+        paths = longer.files(name).paths
+        same = [path.stat().st_ino == inode for path, inode in zip(paths, inodes, strict=False)]
+        assert same == linked[:2]
         longer.seal()
-        assert np.array_equal(FeatureStore.open(longer.target).array("sensor/values"), grown)
+        assert np.array_equal(FeatureStore.open(target).array(name), values)
 
-    def _specs(self, folder: Path, readings: int, plan: str):
-        sizes = Sizes(1, 2, 1, readings, 0, len(TEXT), 1, 2, 1, 2, 3, 0)
-        build = StoreBuild(folder / "s.zarr", arrays(sizes, "float32", "float32"), plan)
-        values = np.random.default_rng(readings).normal(size=(readings, 3)).astype(np.float32)
-        return build, values
-
-    def _with_sensor(self, folder: Path, readings: int, plan: str):
-        build, values = self._specs(folder, readings, plan)
+    def build(
+        self, target: Path, readings: np.ndarray, source: ArraySpec | None = None
+    ) -> StoreBuild:
+        """A build with all its rows, whose first 9,000 readings are linked from the source."""
+        sizes = Sizes(1, 2, 1, len(readings), 0, len(TEXT), 1, 2, 1, 2, 3, 0)
+        build = StoreBuild(target, arrays(sizes, "float32", "float32"), str(len(readings)))
         build.create()
+        if source is not None:
+            build.link_unchanged("sensor/values", target, source, 9000)
         build.allocate()
-        build.write("sensor/values", 0, values)
-        self._finish(build)
-        return build, values
-
-    def _finish(self, build: StoreBuild) -> None:
+        build.write("sensor/values", 0, readings)
         lay_out(build)
         build.commit([0], np.zeros((1, 1, 2), np.float32), [bytes(16)], 0)
-
-
-class TestDiskFull:
-    def test_a_full_disk_is_named_and_the_build_resumes(self, small_disk):
-        build = begun(small_disk)
-        features = rows_of(0, ROWS)
-        keys = [bytes([i] * 16) for i in range(ROWS)]
-        build.commit(range(4), features[:4], keys[:4], build.environment_index({"torch": "1"}))
-        ballast_path = small_disk / "ballast"
-        with pytest.raises(OSError, match="No space"), ballast_path.open("wb") as ballast:
-            while True:
-                ballast.write(bytes(4096))
-                ballast.flush()
-        with pytest.raises(DiskFull, match=r"no space left.*make room"):
-            other = StoreBuild(small_disk / "other.zarr", build.specs, "plan")
-            other.create()
-            other.allocate()
-        ballast_path.unlink()
-        again = resumed(build)
-        assert again.missing().tolist() == list(range(4, ROWS))
-        again.commit(range(4, ROWS), features[4:], keys[4:], 0)
-        again.seal()
-        assert np.array_equal(FeatureStore.open(again.target).array(FEATURES), features)
+        return build
 
 
 class TestLock:
     def test_the_second_builder_is_refused_and_told_of_the_first(self, tmp_path):
+        """Two descriptors of a file exclude each other like two processes."""
         target = tmp_path / "s.zarr"
-        code = (
-            "import sys; from pathlib import Path; from pipeline.store import build_lock\n"
-            "with build_lock(Path(sys.argv[1])): print('held', flush=True); sys.stdin.read()"
-        )
-        holder = subprocess.Popen(
-            [sys.executable, "-c", code, target], stdin=subprocess.PIPE, stdout=subprocess.PIPE
-        )
-        assert holder.stdout is not None
-        with holder:
-            assert holder.stdout.readline() == b"held\n"
-            with pytest.raises(StoreLocked, match=f"process {holder.pid}"), build_lock(target):
-                pass
-            holder.kill()
+        with (
+            build_lock(target),
+            pytest.raises(StoreLocked, match=f"process {os.getpid()}"),
+            build_lock(target),
+        ):
+            pass
         with build_lock(target):
             pass
 
@@ -469,31 +405,21 @@ class TestLock:
             pass
 
     @pytest.mark.parametrize(
-        ("kind", "said"),
+        ("make", "message"),
         [
-            ("folder", "found a folder"),
-            ("pipe", "found a pipe"),
-            ("link to nothing", "no such file"),
-            ("huge", "expected at most 1,000 bytes, found 10,000,000"),
-            ("binary", "found a file that this project did not write"),
-            ("half ours", "found a file that this project did not write"),
+            (os.mkfifo, "found a pipe"),
+            (lambda path: path.symlink_to("nowhere"), "no such file"),
+            (lambda path: path.write_bytes(b"x" * 10**7), "at most 1,000 bytes, found 10,000,000"),
+            (lambda path: path.write_bytes(b"\xff\x00\x1b" * 20), "did not write"),
+            (lambda path: path.write_text("process 7 on elsewhere\nmy thesis\n"), "did not write"),
         ],
     )
-    def test_what_is_no_lock_is_left_as_it_is(self, tmp_path, kind, said):
+    def test_what_is_no_lock_is_left_as_it_is(self, tmp_path, make, message):
         path = tmp_path / "s.zarr.lock"
-        match kind:
-            case "folder":
-                path.mkdir()
-            case "pipe":
-                os.mkfifo(path)
-            case "link to nothing":
-                path.symlink_to("nowhere")
-            case _:
-                text = {"huge": b"x" * 10**7, "binary": b"\xff\x00\x1b" * 20}
-                path.write_bytes(text.get(kind, b"process 7 on elsewhere\nand my thesis\n"))
+        make(path)
         before = path.lstat()
         for look in (build_lock(tmp_path / "s.zarr").__enter__, lambda: lock_holder(path)):
-            with pytest.raises(ConfigError, match=f"s.zarr.lock: .*{said}.*move it away"):
+            with pytest.raises(ConfigError, match=f"s.zarr.lock: .*{message}.*move it away"):
                 look()
         assert not (tmp_path / "nowhere").exists()
         assert (path.lstat().st_size, path.lstat().st_mtime) == (before.st_size, before.st_mtime)
