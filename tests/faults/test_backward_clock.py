@@ -6,9 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.store import FeatureStore
-from stages import extract, train_head
-from stages.command import run
+from tests.store.samples import content
 
 
 @pytest.fixture
@@ -23,35 +21,22 @@ def backwards(recordings: Path, write_episode: Callable[..., Path]) -> Path:
     return file
 
 
-def content(store: Path) -> dict[Path, bytes]:
-    return {path: path.read_bytes() for path in store.rglob("*") if path.is_file()}
-
-
-def test_it_is_refused_and_the_store_untouched(
-    backwards: Path, store: Path, params: Path, capsys: pytest.CaptureFixture[str]
+def test_it_is_refused_or_skipped_and_changes_nothing(
+    backwards: Path, store: Path, params: Path, here
 ) -> None:
     before = content(store)
-    assert run("", extract.main, ["--params", str(params)]) == 2
-    said = capsys.readouterr().err
-    assert "1 of 4 episodes cannot be used" in said
-    assert str(backwards) in said
-    assert "backwards" in said
-    assert "on_bad_episode=skip" in said
+    code, _, complained = here("stages.extract", params)
+    assert code == 2
+    assert "1 of 4 episodes cannot be used" in complained
+    assert str(backwards) in complained
+    assert "backwards" in complained
+    assert "on_bad_episode=skip" in complained
     assert content(store) == before
     assert not store.with_name("made.zarr.part").exists()
-    assert (
-        run("", train_head.main, ["--params", str(params), "--set", "train_head.max_steps=2"]) == 0
-    )
-
-
-def test_skipped_it_changes_nothing(
-    backwards: Path, store: Path, params: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    before = content(store)
-    skip = ["--params", str(params), "--set", "data.on_bad_episode=skip"]
-    assert run("", extract.main, skip) == 0
-    said = capsys.readouterr().out
-    assert str(backwards) in said
-    assert "up to date, nothing to do" in said
+    code, printed, complained = here("stages.extract", params, "--set", "data.on_bad_episode=skip")
+    assert code == 0, complained
+    assert str(backwards) in printed
+    assert "up to date, nothing to do" in printed
     assert content(store) == before
-    assert len(FeatureStore.open(store).episodes) == 3
+    code, _, complained = here("stages.train_head", params, "--set", "train_head.max_steps=2")
+    assert code == 0, complained

@@ -11,7 +11,6 @@ from pathlib import Path
 import pytest
 
 from pipeline.store import FeatureStore
-from pipeline.store.archive import is_archive
 from stages.command import run
 
 
@@ -86,16 +85,6 @@ def test_train_and_evaluate(
     assert (output / "best" / "policy.json").exists()
     full_then_free(5_000, "stages.evaluate", params)
     assert (report / "metrics.json").exists()
-
-
-def test_archive(
-    tiny_store: Callable[..., Path], head_params, small_disk: Path, full_then_free, tmp_path: Path
-) -> None:
-    store = tiny_store(tmp_path, episodes=20, sensor_channels=50)
-    output = small_disk / "copy.archive.zarr"
-    params = head_params(store, archive={"output": str(output)})
-    full_then_free(300_000, "stages.archive", params)
-    assert is_archive(output)
 
 
 def test_merge(
