@@ -306,8 +306,9 @@ def _owner(path: Path) -> OutputKind | None:
 
     None where this project did not write it.
     """
-    if marked := next((kind for kind in (STORE, ARCHIVE, KEPT) if kind.marks(path)), None):
-        return marked
+    for kind in (STORE, ARCHIVE, KEPT):
+        if kind.marks(path):
+            return OutputKind(kind.name)  # looks at the marker alone: metadata may be damaged
     with suppress(StoreIncomplete):
         return STORE if STORE.owns(path) else None
     return None

@@ -113,21 +113,21 @@ class MergedEpisodes:
         taken: list[tuple[FeatureStore, Episode]] = []
         digests: set[str] = set()
         names: dict[tuple[str, str], Path] = {}
-        for store, episode in [
-            (opened, episode) for opened in stores for episode in opened.episodes
-        ]:
-            if episode.digest in digests:
-                continue
-            digests.add(episode.digest)
-            name = _free_name(episode, store.path, names)
-            if name != episode.id:
-                print(
-                    f"{store.path}: its {episode.source}/{episode.id} is another episode than that "
-                    f"of {names[episode.source, episode.id]}, and named {episode.source}/{name}"
-                )
-            names[episode.source, name] = store.path
-            taken.append((store, episode))
-            self.episodes.append(replace(episode, id=name))
+        for store in stores:
+            for episode in store.episodes:
+                if episode.digest in digests:
+                    continue
+                digests.add(episode.digest)
+                name = _free_name(episode, store.path, names)
+                if name != episode.id:
+                    other = names[episode.source, episode.id]
+                    print(
+                        f"{store.path}: its {episode.source}/{episode.id} is another episode than "
+                        f"that of {other}, and named {episode.source}/{name}"
+                    )
+                names[episode.source, name] = store.path
+                taken.append((store, episode))
+                self.episodes.append(replace(episode, id=name))
         self.twice = sum(len(store.episodes) for store in stores) - len(self.episodes)
         self.arrays = index_arrays(self.episodes, self.sources)
         self.runs = [*self._runs(taken)]

@@ -333,9 +333,10 @@ def asked(monkeypatch) -> list[tuple[tuple[int, ...], list[int], int]]:
 
 class TestMemory:
     def test_a_store_larger_than_memory_gives_the_same(self, path, store, asked):
+        expected = store.gather([31, 95], horizon=2, sensor_window=9, state_window=5)
+        asked.clear()
         large = FeatureStore.open(path)
         batch = large.gather([31, 95], horizon=2, sensor_window=9, state_window=5)
-        expected = store.gather([31, 95], horizon=2, sensor_window=9, state_window=5)
         for name, value in vars(expected).items():
             assert torch.equal(getattr(batch, name), value)
         ends = store.array("tick/sensor_end")[[31, 95]]
