@@ -482,6 +482,7 @@ class TestLocalProcesses:
 class TestStart:
     """Of local processes, which takes long enough to be cut short."""
 
+    @pytest.mark.slow
     def test_a_worker_killed_as_it_starts_is_said(self, params_file, begin, tmp_path):
         process = self.begun(begin, params_file, tmp_path)
         (tmp_path / "kill").touch()

@@ -186,3 +186,10 @@ def test_auto_takes_what_memory_allows():
     assert sum(len(batch) for batch, _ in encoder.encoded(ready(i, [1]) for i in range(300))) == 300
     assert encoder.size.settled
     assert encoder.size.current == 16
+
+
+def test_a_batch_that_is_not_full_says_nothing_about_its_size():
+    encoder = encoder_of(FakeVLM(overhead_s=100.0), "auto", 1)
+    for _ in range(9):
+        assert len(list(encoder.encoded([ready(0, [1]), ready(1, [2])]))) == 1
+    assert encoder.size.current == 8
