@@ -726,7 +726,7 @@ class TestRefusals:
         assert len(FeatureStore.open(params.extract.store).episodes) == 3
 
     def test_skip_leaves_bad_episodes_out_and_lists_them_every_time(
-        self, changed, recordings, no_model_later, counted, write_episode
+        self, changed, recordings, no_model_later, counted, write_episode, monkeypatch
     ):
         bad = write_episode(recordings / "Press" / "episode_9", 9, views=("View9",))
         npz = bad / "sensor_data.npz"
@@ -738,7 +738,9 @@ class TestRefusals:
         assert "episode_9" not in [one.id for one in store.episodes]
         assert store.streams["views"] == ["View1", "View2"], "it decides nothing"
         no_model_later(images=False)
-        report, said = run(params)
+        with monkeypatch.context() as patch:
+            patch.delattr(Image, "open")
+            report, said = run(params)
         assert report is None
         assert any(str(npz) in line for line in said)
         counted.clear()
