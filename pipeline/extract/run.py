@@ -55,35 +55,25 @@ def extract(params: Params, say: Say) -> ExtractionReport | None:
             return None
         if unwritable is not None:
             raise unwritable
-        if state == "resume":
-            build = places.begun_build()
-        else:
-            places.refuse_to_lose(surveyed, embodiment_of(checked))
-            for line in _timeline_lines(surveyed, checked):
-                say(line)
-            build = StoreBuild(target, build_arrays(checked, surveyed), surveyed.plan)
+        resumes = state == "resume"
+        build = places.begun_build() if resumes else _new_build(surveyed, checked, places, say)
         with closing(build):
             rows = build.specs[FEATURES].shape[0]
-            if state == "resume":
-                missing = build.missing()
-                known = [RowSource(places.part)]
+            if resumes:
+                missing, known = build.missing(), [RowSource(places.part)]
                 taken = rows - len(missing)
             else:
-                check_readable(build, checked, surveyed)
-                missing = np.arange(rows)
                 begun = [] if places.begun is None else [places.part]
-                known = row_sources([*begun, *places.known], surveyed)
+                missing, known = np.arange(rows), row_sources([*begun, *places.known], surveyed)
                 taken = count_known(checked, surveyed, known)
             for line in plan_lines(build, surveyed, digests, places, state, known, taken):
                 say(line)
             if only_plan:
                 return None
-            if state == "new":
+            if not resumes:
                 check_space(build, checked, known)
-                if isinstance(surveyed.extract.workers, str) and taken < rows:
-                    from pipeline.extract.cluster import check_scheduler  # dask: a second to import
-
-                    check_scheduler(surveyed.extract.workers)
+                if taken < rows:
+                    _check_workers(surveyed)
                 # From here on, no check refuses the run.
                 places = places.set_build_aside(surveyed, say)
                 lay_out(build, checked, surveyed, row_sources(places.known, surveyed))
@@ -128,6 +118,26 @@ def _survey(
     if state != "current":
         resolve_device(params.extract.device)
     return sound_episodes(surveyed, digests) if state == "new" else (surveyed, [])
+
+
+def _new_build(
+    surveyed: Survey, checked: Sequence[CheckedEpisode], places: StorePlaces, say: Say
+) -> StoreBuild:
+    """A build of these episodes, of which nothing is written yet; raises where it is refused."""
+    places.refuse_to_lose(surveyed, embodiment_of(checked))
+    for line in _timeline_lines(surveyed, checked):
+        say(line)
+    build = StoreBuild(places.target, build_arrays(checked, surveyed), surveyed.plan)
+    check_readable(build, checked, surveyed)
+    return build
+
+
+def _check_workers(surveyed: Survey) -> None:
+    """Raise `ConfigError` where `extract.workers` is an address that no scheduler answers at."""
+    if isinstance(surveyed.extract.workers, str):
+        from pipeline.extract.cluster import check_scheduler  # dask: a second to import
+
+        check_scheduler(surveyed.extract.workers)
 
 
 def _executor(surveyed: Survey) -> Executor:

@@ -276,11 +276,10 @@ def _reasons(surveyed: Survey, before: RowSource | None) -> Iterator[str]:
         yield f"{len(changed)} episode(s) are new or have other {what}"
     if gone:
         yield f"{gone} episode(s) of the store are gone or changed"
-    if not (lines or changed or gone):
-        yield (
-            "extract.sensor_dtype, the rate of ticks, the order of episodes or how actions are "
-            "derived changed"
-        )
+    if unrated := before.attributes.action_hz is None:
+        yield "the store does not say the rate of its ticks"
+    if not (lines or changed or gone or unrated):
+        yield "extract.sensor_dtype, the order of episodes or how actions are derived changed"
 
 
 def _warnings(surveyed: Survey, before: RowSource | None, missing: int) -> Iterator[str]:

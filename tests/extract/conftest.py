@@ -6,6 +6,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
+from contextlib import closing
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -18,6 +19,10 @@ from PIL import Image
 
 from pipeline.base.config import Params
 from pipeline.extract import extract
+from pipeline.extract.state import StorePlaces
+from pipeline.store import FeatureStore
+from pipeline.store.schema import ARRAY_NAMES
+from pipeline.vlm.qwen import FrozenVLM
 
 
 @pytest.fixture(scope="session")
@@ -157,6 +162,45 @@ def params_file(document: dict[str, Any], tmp_path: Path) -> Path:
     path = tmp_path / "params.yaml"
     path.write_text(yaml.safe_dump(document))
     return path
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    """Every file of a folder."""
+    files = (path for path in folder.rglob("*") if path.is_file())
+    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in files}
+
+
+def run(params: Params) -> tuple[Any, list[str]]:
+    """The report of an extraction and the lines that it printed."""
+    lines: list[str] = []
+    return extract(params, lines.append), lines
+
+
+def assert_same(found: FeatureStore, expected: FeatureStore) -> None:
+    """All exactly, but features, whose batches differ, within the noise of float32."""
+    for name in set(ARRAY_NAMES) - {"vl/features", "vl/checksum"}:
+        assert np.array_equal(found.array(name), expected.array(name), equal_nan=True), name
+    assert np.allclose(found.array("vl/features"), expected.array("vl/features"), atol=2e-5)
+
+
+def missing_of(store: Path) -> set[int]:
+    """The rows that the unfinished build of a store lacks."""
+    with closing(StorePlaces(store).begun_build()) as build:
+        return set(build.missing().tolist())
+
+
+@pytest.fixture
+def counted(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """The size of each batch that the model is given."""
+    rows: list[int] = []
+    real = FrozenVLM.submit
+
+    def submit(self: FrozenVLM, batch: Any) -> Any:
+        rows.append(len(batch))
+        return real(self, batch)
+
+    monkeypatch.setattr(FrozenVLM, "submit", submit)
+    return rows
 
 
 @pytest.fixture

@@ -86,9 +86,7 @@ def encoder_of(vlm: FakeVLM, batch_size: Any, variants: int = K) -> Encoder:
     ("batch_size", "room", "passes"),
     [
         (6, 99, [6, 6, 3]),
-        (7, 99, [6, 6, 3]),
         (2, 99, [2, 1] * 5),  # less than a row's variants: a row takes two passes
-        (1, 99, [1] * 15),
         (12, 4, [12, 6, 3, 3, 3, 3, 3]),  # out of memory: 12 -> 6 -> 3
         (12, 2, [12, 6, 3, 1, 1, 1, *[1] * 12]),
     ],
@@ -188,3 +186,10 @@ def test_auto_takes_what_memory_allows():
     assert sum(len(batch) for batch, _ in encoder.encoded(ready(i, [1]) for i in range(300))) == 300
     assert encoder.size.settled
     assert encoder.size.current == 16
+
+
+def test_a_batch_that_is_not_full_says_nothing_about_its_size():
+    encoder = encoder_of(FakeVLM(overhead_s=100.0), "auto", 1)
+    for _ in range(9):
+        assert len(list(encoder.encoded([ready(0, [1]), ready(1, [2])]))) == 1
+    assert encoder.size.current == 8

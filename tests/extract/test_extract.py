@@ -27,7 +27,6 @@ from pipeline.data import Channels, RecordedAction, Stream, open_recordings
 from pipeline.data.lerobot_rows import stored_clock
 from pipeline.data.timeline import build_timeline
 from pipeline.data.windowed import WindowedRecording
-from pipeline.extract import extract
 from pipeline.extract.survey import survey
 from pipeline.simulation.insertion_formats import write_lerobot
 from pipeline.simulation.recorder import simulate_episode
@@ -36,31 +35,38 @@ from pipeline.store.schema import ARRAY_NAMES, INCREMENTAL
 from pipeline.vlm.feature_spec import feature_spec
 from pipeline.vlm.preparation import Preparer
 from pipeline.vlm.qwen import FrozenVLM
-
-
-def run(params) -> tuple[object, list[str]]:
-    said: list[str] = []
-    return extract(params, said.append), said
-
-
-def content(folder: Path) -> dict[str, bytes]:
-    """Every file of a folder."""
-    files = (path for path in folder.rglob("*") if path.is_file())
-    return {str(path.relative_to(folder)): path.read_bytes() for path in files}
+from tests.extract.conftest import contents, run
 
 
 @pytest.fixture
-def counted(monkeypatch):
-    """How many rows the model is asked for."""
-    rows: list[int] = []
-    real = FrozenVLM.submit
+def narrower(monkeypatch):
+    """`narrower(folder)`: the sensor of recordings in this folder has seven channels."""
 
-    def submit(self, batch):
-        rows.append(len(batch))
-        return real(self, batch)
+    def begin(folder: Path) -> None:
+        real = WindowedRecording.sensor
 
-    monkeypatch.setattr(FrozenVLM, "submit", submit)
-    return rows
+        def sensor(self):
+            stream = real(self)
+            if folder not in Path(self.path).parents or stream is None:
+                return stream
+            channels = Channels(stream.channels.names[:7], stream.channels.units[:7])
+            return Stream(channels, stream.time, stream.values[:, :7])
+
+        monkeypatch.setattr(WindowedRecording, "sensor", sensor)
+
+    return begin
+
+
+@pytest.fixture
+def unmount(recordings):
+    """`unmount()` takes one of three recordings away, `unmount.back()` puts it back."""
+    place, away = recordings / "Press", recordings.with_name("unmounted")
+
+    def take_away() -> None:
+        place.rename(away)
+
+    take_away.back = lambda: away.rename(place)
+    return take_away
 
 
 @pytest.fixture
@@ -78,62 +84,33 @@ def no_model_later(monkeypatch):
     return begin
 
 
-@pytest.fixture
-def rounded_clocks(changed, tmp_path, monkeypatch):
-    """`rounded_clocks(action_hz)`: params of a LeRobot set whose store was made by a reader that
-    kept clocks as stored, with ticks that saw no rounding."""
+def test_clocks_that_are_read_exactly_now_are_all_that_changes_in_a_store(
+    changed, tmp_path, monkeypatch, no_model_later
+):
+    """An earlier reader kept the clocks of LeRobot sets as stored, and ticks saw no rounding."""
     write_lerobot(tmp_path / "set", iter([simulate_episode(4, 0.0)]))
     source = {"name": "made", "path": str(tmp_path / "set"), "action_kind": "absolute"}
-
-    def extracted(action_hz: float):
-        data = {"sources": [source], "action_hz": action_hz, "views": ["View1"]}
-        params = changed(data={**data, "vlm_reuse_count": 1}, vlm={"pooling": ["mean"]})
-        with monkeypatch.context() as before:
-            as_stored = lambda table, fps, where: stored_clock(table, where)  # noqa: E731
-            before.setattr("pipeline.data.lerobot.read_clock", as_stored)
-            before.setattr("pipeline.data.timeline.rounding", lambda clock: 0.0)
-            run(params)
-        return params
-
-    return extracted
-
-
-class TestRoundedClocks:
-    def test_of_the_recorded_rows_are_all_that_changes(self, rounded_clocks, no_model_later):
-        params = rounded_clocks(10)
-        before = FeatureStore.open(params.extract.store)
-        no_model_later(images=False)
-        report, said = run(params)
-        store = FeatureStore.open(params.extract.store)
-        assert (report.taken, report.computed) == (report.rows, 0)
-        assert any("have other files, how these are read" in line for line in said)
-        exact = np.arange(len(store.array("tick/time"))) / 10
-        for name in ("tick/time", "vl/time", "state/time"):
-            assert np.array_equal(store.array(name), exact)
-            assert np.array_equal(before.array(name), exact.astype(np.float32))
-        assert np.array_equal(store.array("vl/frame_time")[:, 0], exact)
-        others = {"vl/features", "vl/key", "vl/checksum", "vl/slot_valid", "tick/vl_row"}
-        others |= {"tick/action", "tick/state_end", "tick/sensor_end"}
-        others |= {"state/values", "sensor/values", "sensor/time"}
-        for name in others:
-            assert np.array_equal(store.array(name), before.array(name)), name
-
-    def test_of_resampled_rows_cost_the_rows_of_other_frames(self, rounded_clocks, counted):
-        params = rounded_clocks(5)
-        before = FeatureStore.open(params.extract.store)
-        known = {key.tobytes(): row for row, key in enumerate(before.array("vl/key"))}
-        counted.clear()
-        report, _ = run(params)
-        store = FeatureStore.open(params.extract.store)
-        (episode,) = store.episodes
-        assert np.array_equal(store.array("tick/state_end"), 2 * np.arange(len(episode.ticks)) + 1)
-        assert not np.array_equal(before.array("tick/state_end"), store.array("tick/state_end"))
-        assert sum(counted) == report.computed == report.rows - report.taken
-        assert 0 < report.taken < report.rows
-        for row, key in enumerate(store.array("vl/key")):
-            if key.tobytes() in known:
-                old = before.array("vl/features")[known[key.tobytes()]]
-                assert np.array_equal(store.array("vl/features")[row], old)
+    data = {"sources": [source], "action_hz": 10, "views": ["View1"], "vlm_reuse_count": 1}
+    params = changed(data=data, vlm={"pooling": ["mean"]})
+    with monkeypatch.context() as earlier:
+        as_stored = lambda table, fps, where: stored_clock(table, where)  # noqa: E731
+        earlier.setattr("pipeline.data.lerobot.read_clock", as_stored)
+        earlier.setattr("pipeline.data.timeline.rounding", lambda clock: 0.0)
+        run(params)
+    before = FeatureStore.open(params.extract.store)
+    no_model_later(images=False)
+    report, said = run(params)
+    store = FeatureStore.open(params.extract.store)
+    assert (report.taken, report.computed) == (report.rows, 0)
+    assert any("have other files, how these are read" in line for line in said)
+    exact = np.arange(len(store.array("tick/time"))) / 10
+    clocks = {"tick/time", "vl/time", "state/time"}
+    for name in clocks:
+        assert np.array_equal(store.array(name), exact)
+        assert np.array_equal(before.array(name), exact.astype(np.float32))
+    assert np.array_equal(store.array("vl/frame_time")[:, 0], exact)
+    for name in {*ARRAY_NAMES} - clocks - {"vl/frame_time", "episode/text", "episode/text_start"}:
+        assert np.array_equal(store.array(name), before.array(name)), name
 
 
 class TestWhatItWrites:
@@ -185,23 +162,11 @@ class TestWhatItWrites:
                 assert torch.allclose(torch.from_numpy(stored), alone[0], atol=2e-5)
                 assert np.array_equal(store.array("vl/slot_valid")[row], valid[0].numpy())
 
-    @pytest.mark.usefixtures("extracted")
-    def test_a_missing_view_is_marked_and_zero(self, params):
-        store = FeatureStore.open(params.extract.store)
-        press = next(one for one in store.episodes if one.id == "episode_3")
-        view1 = [slot.get("view") == "View1" for slot in store.attrs["slots"]]
-        rows = slice(press.vl_rows.start, press.vl_rows.stop)
-        assert np.isnan(store.array("vl/frame_time")[rows, 0]).all()
-        assert not store.array("vl/slot_valid")[rows][:, view1].any()
-        assert not store.array("vl/features")[rows][:, view1].any()
-        assert store.array("vl/slot_valid")[rows][:, np.logical_not(view1)].all()
-
-    @pytest.mark.parametrize("dtype", ["float16", "bfloat16"])
-    def test_stored_dtypes(self, changed, dtype):
-        params = changed(extract={"dtype": dtype, "sensor_dtype": "float16"})
+    def test_stored_dtypes(self, changed):
+        params = changed(extract={"dtype": "bfloat16", "sensor_dtype": "float16"})
         run(params)
         batch = FeatureStore.open(params.extract.store).gather([0])
-        assert batch.features.dtype == getattr(torch, dtype)
+        assert batch.features.dtype == torch.bfloat16
         assert batch.sensor.dtype == torch.float16
 
     def test_a_sensor_that_does_not_fit_float16_is_refused(self, changed, recordings):
@@ -214,8 +179,8 @@ class TestWhatItWrites:
 
 
 class TestWhatItTakesOver:
+    @pytest.mark.usefixtures("extracted")
     def test_nothing_changed_needs_neither_model_nor_frame(self, params, no_model_later):
-        run(params)
         no_model_later()
         report, said = run(params)
         assert report is None
@@ -223,8 +188,8 @@ class TestWhatItTakesOver:
             f"{params.extract.store}: up to date, nothing to do (stages.verify reads what it holds)"
         ]
 
-    def test_nothing_changed_imports_nothing_that_takes_seconds(self, params_file, params):
-        run(params)
+    @pytest.mark.usefixtures("extracted")
+    def test_nothing_changed_imports_nothing_that_takes_seconds(self, params_file):
         heavy = {"torch", "transformers", "dask", "distributed", "peft", "scipy", "matplotlib"}
         code = (
             "import sys\nfrom stages.extract import main\nfrom stages.command import run\n"
@@ -263,7 +228,8 @@ class TestWhatItTakesOver:
         assert report.taken == rows
         assert sum(counted) == report.rows - rows
         assert any(f"{rows} known" in line for line in said), "without decoding a frame"
-        assert any("vlm_reuse_count" in line for line in said)
+        assert any("are new or have other files" in line for line in said)
+        assert not any("gone or changed" in line for line in said)
 
     @pytest.mark.usefixtures("extracted")
     def test_another_prompt_computes_everything_and_says_why(self, params, changed, counted):
@@ -274,17 +240,16 @@ class TestWhatItTakesOver:
         assert any('prompt: "{instruction}' in line for line in said)
 
     @pytest.mark.usefixtures("extracted")
-    def test_the_speed_knobs_change_nothing(self, params, changed, no_model_later):
+    def test_what_changes_nothing(self, params, changed, recordings, no_model_later):
         no_model_later()
         knobs = {"batch_size": 1, "decode_threads": 1, "device": "cpu"}
         assert run(changed(extract=knobs, vlm={"attention": "eager"}))[0] is None
-
-    @pytest.mark.usefixtures("extracted")
-    def test_a_touched_file_is_read_again_and_found_equal(self, params, recordings):
-        run(params)  # notes what the files hold
         path = recordings / "Touch_dot/episode_1/robot_states.npz"
         path.write_bytes(path.read_bytes())
-        assert run(params)[0] is None
+        assert run(params)[0] is None, "a touched file is read again"
+        ledger = params.extract.store.with_name("made.zarr.files.sqlite")
+        ledger.write_bytes(ledger.read_bytes()[:100] + b"no database" * 100)
+        assert run(params)[0] is None, "a lost ledger costs only reading"
 
     @pytest.mark.usefixtures("extracted")
     def test_a_group_is_kept_and_stores_without_one_are_as_before(self, params, recordings):
@@ -319,6 +284,7 @@ class TestWhatItTakesOver:
                 contents.append(survey(params, digests).contents)
         assert len(contents[0] - contents[1]) == 1
 
+    @pytest.mark.usefixtures("extracted")
     def test_a_changed_file_is_noticed(self, params, recordings):
         run(params)  # notes what the files hold
         path = recordings / "Touch_dot/episode_1/robot_states.npz"
@@ -330,20 +296,6 @@ class TestWhatItTakesOver:
         assert report.computed == 0, "its frames did not change"
         assert any("1 episode(s) are new or have other files" in line for line in said)
         assert any("1 episode(s) of the store are gone or changed" in line for line in said)
-
-    @pytest.mark.usefixtures("extracted")
-    def test_another_reuse_count_is_no_lost_episode(self, params):
-        other = params.data.model_copy(update={"vlm_reuse_count": 2})
-        _, said = run(params.model_copy(update={"data": other}))
-        assert any("are new or have other files" in line for line in said)
-        assert not any("gone or changed" in line for line in said)
-
-    @pytest.mark.usefixtures("extracted")
-    def test_a_lost_ledger_costs_nothing_but_reading(self, params, no_model_later):
-        ledger = params.extract.store.with_name("made.zarr.files.sqlite")
-        ledger.write_bytes(ledger.read_bytes()[:100] + b"no database" * 100)
-        no_model_later()
-        assert run(params)[0] is None
 
 
 class TestAbandonedBuilds:
@@ -391,9 +343,7 @@ class TestAbandonedBuilds:
         _, said = run(changed(vlm={"prompt": "{images}"}))
         assert any("is given up: prompt:" in line for line in said)
 
-    @pytest.mark.parametrize(
-        "rotten", ["tick/action", "sensor/values", "vl/frame_time", "zarr.json"]
-    )
+    @pytest.mark.parametrize("rotten", ["tick/action", "zarr.json"])
     def test_bit_rot_is_not_sealed_as_right(
         self, params, changed, monkeypatch, counted, extracted_once, rotten
     ):
@@ -444,27 +394,20 @@ class TestWhatWouldBeLost:
         self, params, changed, recordings, tmp_path, write_episode, no_model_later
     ):
         write_episode(tmp_path / "other" / "Task" / "episode_9", 9)
-        before = content(params.extract.store)
+        before = contents(params.extract.store)
         no_model_later(images=False)
         for plan in (True, False):
             other = {"sources": [{"name": "second", "path": str(tmp_path / "other")}]}
             with pytest.raises(StoreMismatch, match=r"made there, second here.*\n.*extract\.store"):
                 run(changed(data=other, extract={"plan": plan}))
-        assert content(params.extract.store) == before
+        assert contents(params.extract.store) == before
 
     @pytest.mark.usefixtures("extracted")
     def test_another_embodiment_of_the_same_source_is_refused(
-        self, params, changed, tmp_path, monkeypatch, write_episode, no_model_later
+        self, changed, tmp_path, narrower, write_episode, no_model_later
     ):
         write_episode(tmp_path / "other" / "Task" / "episode_9", 9)
-        real = WindowedRecording.sensor
-
-        def narrower(self):
-            stream = real(self)
-            channels = Channels(stream.channels.names[:7], stream.channels.units[:7])
-            return Stream(channels, stream.time, stream.values[:, :7])
-
-        monkeypatch.setattr(WindowedRecording, "sensor", narrower)
+        narrower(tmp_path / "other")
         no_model_later(images=False)
         other = {"sources": [{"name": "made", "path": str(tmp_path / "other")}]}
         with pytest.raises(StoreMismatch, match=r"sensor.names: .* -> "):
@@ -472,36 +415,36 @@ class TestWhatWouldBeLost:
 
     @pytest.mark.usefixtures("extracted")
     def test_a_source_that_is_missing_for_a_moment_costs_no_row(
-        self, params, changed, recordings, counted
+        self, params, changed, unmount, counted
     ):
         store, previous = params.extract.store, params.extract.store.with_name("made.zarr.previous")
-        whole = content(store)
-        (recordings / "Press").rename(recordings.with_name("unmounted"))
+        whole = contents(store)
+        unmount()
         for plan in (True, False):
             _, said = run(changed(extract={"plan": plan}))
             assert any("1 episode(s) that are not in this run" in line for line in said)
             assert any(str(previous) in line for line in said)
             assert previous.exists() != plan
         assert len(FeatureStore.open(store).episodes) == 2
-        recordings.with_name("unmounted").rename(recordings / "Press")
+        unmount.back()
         _, said = run(changed(extract={"plan": True}))
         assert any(line.startswith(f"{previous} is removed when") for line in said)
         report, _ = run(params)
         assert not counted, "its rows were there"
         assert report.taken == report.rows
         assert not previous.exists(), "until the next successful run"
-        assert content(store) == whole
+        assert contents(store) == whole
 
     @pytest.mark.usefixtures("extracted")
     def test_an_interrupted_return_still_takes_the_rows_of_the_kept_store(
-        self, params, recordings, monkeypatch, counted
+        self, params, unmount, monkeypatch, counted
     ):
         def stop(*_: object) -> None:
             raise KeyboardInterrupt
 
-        (recordings / "Press").rename(recordings.with_name("unmounted"))
+        unmount()
         run(params)
-        recordings.with_name("unmounted").rename(recordings / "Press")
+        unmount.back()
         with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
             patch.setattr(StoreBuild, "mark", stop)
             run(params)
@@ -511,29 +454,29 @@ class TestWhatWouldBeLost:
 
     @pytest.mark.usefixtures("extracted")
     def test_a_store_behind_a_link_is_kept_for_its_rows_as_it_is(
-        self, params, recordings, tmp_path, counted
+        self, params, unmount, tmp_path, counted
     ):
         store, behind = params.extract.store, tmp_path / "big" / "made.zarr"
         previous = store.with_name("made.zarr.previous")
         behind.parent.mkdir()
         store.rename(behind)
         store.symlink_to(os.path.relpath(behind, store.parent))
-        whole = content(behind)
-        (recordings / "Press").rename(recordings.with_name("unmounted"))
+        whole = contents(behind)
+        unmount()
         run(params)
         assert not store.is_symlink()
-        assert content(behind) == content(previous) == whole
+        assert contents(behind) == contents(previous) == whole
         assert run(params)[0] is None, "a later run goes on"
-        recordings.with_name("unmounted").rename(recordings / "Press")
+        unmount.back()
         report, _ = run(params)
         assert not counted, "its rows were there"
         assert report.taken == report.rows
         assert not previous.is_symlink(), "until the next successful run"
-        assert content(behind) == content(store) == whole
+        assert contents(behind) == contents(store) == whole
 
     @pytest.mark.usefixtures("extracted")
-    def test_says_what_only_the_store_kept_before_holds(self, params, recordings):
-        (recordings / "Press").rename(recordings.with_name("unmounted"))
+    def test_says_what_only_the_store_kept_before_holds(self, params, recordings, unmount):
+        unmount()
         run(params)
         (lost, *_) = sorted(path for path in recordings.rglob("episode_*") if path.is_dir())
         shutil.rmtree(lost)
@@ -549,20 +492,22 @@ class TestWhatWouldBeLost:
             shutil.copytree(params.extract.store, f"{params.extract.store}{suffix}")
             for suffix in (".previous", ".old", ".known-good")
         ]
-        before = [content(Path(copy)) for copy in copies]
+        before = [contents(Path(copy)) for copy in copies]
         run(params)
         shutil.copytree(recordings / "Press/episode_3", recordings / "Press/episode_4")
         run(params)
-        assert [content(Path(copy)) for copy in copies] == before
+        assert [contents(Path(copy)) for copy in copies] == before
         shutil.rmtree(recordings / "Press")
         with pytest.raises(ConfigError, match=r"made\.zarr\.previous: .*left as it is|was left"):
             run(params)
-        assert [content(Path(copy)) for copy in copies] == before
+        assert [contents(Path(copy)) for copy in copies] == before
 
     @pytest.mark.usefixtures("extracted")
-    @pytest.mark.parametrize("step", range(4))
-    def test_a_kill_while_it_is_kept_leaves_both(self, params, recordings, monkeypatch, step):
-        (recordings / "Press").rename(recordings.with_name("unmounted"))
+    @pytest.mark.parametrize(
+        "step", [1, 3, *(pytest.param(step, marks=pytest.mark.slow) for step in (0, 2))]
+    )
+    def test_a_kill_while_it_is_kept_leaves_both(self, params, unmount, monkeypatch, step):
+        unmount()
         steps = 0
 
         def counting(real):
@@ -618,24 +563,6 @@ def test_a_store_that_a_cache_handed_out_as_symbolic_links_is_not_written_throug
     assert {path: path.read_bytes() for path in before} == before
 
 
-class TestOutOfMemory:
-    @pytest.mark.usefixtures("extracted")
-    def test_halves_the_batch_and_goes_on(self, params, monkeypatch):
-        expected = FeatureStore.open(params.extract.store).array("vl/features").copy()
-        shutil.rmtree(params.extract.store)
-        real = FrozenVLM.submit
-
-        def submit(self, batch):
-            if len(batch) > 1:
-                raise torch.OutOfMemoryError("no memory for two")
-            return real(self, batch)
-
-        monkeypatch.setattr(FrozenVLM, "submit", submit)
-        run(params)
-        found = FeatureStore.open(params.extract.store).array("vl/features")
-        assert np.allclose(found, expected, atol=2e-5)
-
-
 class TestPlan:
     def test_only_says_what_it_would_do(self, changed, no_model_later):
         params = changed(extract={"plan": True})
@@ -656,8 +583,6 @@ class TestPlan:
         ("action_hz", "said"),
         [
             (10, None),
-            (5, "ticks at 5 Hz, recorded at 10 Hz: actions are left out between ticks"),
-            (20, "ticks at 20 Hz, recorded at 10 Hz: actions are held"),
             (
                 1000,
                 "ticks at 1000 Hz, recorded at 10 Hz: actions are held, "
@@ -680,8 +605,7 @@ class TestPlan:
         ("dtype", "extract", "warned"),
         [
             ("bfloat16", {"device": "cpu"}, True),
-            ("float16", {"device": "cpu", "workers": 2}, True),
-            ("float32", {"device": "cpu"}, False),
+            ("float32", {"device": "cpu", "workers": 2}, False),
             ("bfloat16", {"device": "cpu", "workers": "tcp://gpus:8786"}, False),
         ],
     )
@@ -692,9 +616,10 @@ class TestPlan:
         assert all(dtype in line and "vlm.dtype=float32" in line for line in warnings)
 
     @pytest.mark.usefixtures("extracted")
-    def test_names_a_time_once_a_speed_is_known(self, params, changed):
-        _, said = run(changed(extract={"plan": True}, data={"vlm_reuse_count": 2}))
-        assert any("rows/s, as last measured" in line for line in said)
+    def test_names_a_time_once_a_speed_is_known(self, changed):
+        for sections in {"data": {"vlm_reuse_count": 2}}, {"vlm": {"prompt": "{images}"}}:
+            _, said = run(changed(extract={"plan": True}, **sections))
+            assert any("rows/s, as last measured" in line for line in said)
 
     @pytest.mark.usefixtures("extracted")
     def test_warns_of_a_view_that_costs_every_row_and_says_the_way_out(
@@ -717,11 +642,6 @@ class TestPlan:
             _, said = run(changed(extract={"plan": True}, data={"action_rotation": rotation}))
             warnings = [line for line in said if line.startswith("WARNING: 1 of 3 episode(s)")]
             assert len(warnings) == count
-
-    @pytest.mark.usefixtures("extracted")
-    def test_a_speed_is_known_under_another_prompt_too(self, params, changed):
-        _, said = run(changed(extract={"plan": True}, vlm={"prompt": "{images}"}))
-        assert any("rows/s, as last measured" in line for line in said)
 
 
 class TestRefusals:
@@ -763,7 +683,7 @@ class TestRefusals:
         assert str(image) in text
         assert "on_bad_episode=skip" in text
 
-    @pytest.mark.parametrize("name", ["a\\b", "zarr.json", "\u00e9" * 101])
+    @pytest.mark.parametrize("name", ["a\\b", "zarr.json"])
     def test_a_view_that_no_reader_of_a_store_would_take(
         self, params, recordings, no_model_later, name
     ):
@@ -806,31 +726,27 @@ class TestRefusals:
         assert len(FeatureStore.open(params.extract.store).episodes) == 3
 
     def test_skip_leaves_bad_episodes_out_and_lists_them_every_time(
-        self, changed, recordings, no_model_later
+        self, changed, recordings, no_model_later, counted, write_episode, monkeypatch
     ):
-        npz = recordings / "Touch_dot/episode_1/sensor_data.npz"
+        bad = write_episode(recordings / "Press" / "episode_9", 9, views=("View9",))
+        npz = bad / "sensor_data.npz"
         npz.write_bytes(npz.read_bytes()[:5000])
         params = changed(data={"on_bad_episode": "skip"})
         _, said = run(params)
         assert any(line.startswith("skipped made") and str(npz) in line for line in said)
         store = FeatureStore.open(params.extract.store)
-        assert [one.id for one in store.episodes] == ["episode_3", "episode_2"]
-        no_model_later()
-        report, said = run(params)
+        assert "episode_9" not in [one.id for one in store.episodes]
+        assert store.streams["views"] == ["View1", "View2"], "it decides nothing"
+        no_model_later(images=False)
+        with monkeypatch.context() as patch:
+            patch.delattr(Image, "open")
+            report, said = run(params)
         assert report is None
         assert any(str(npz) in line for line in said)
-
-    def test_a_skipped_episode_decides_nothing(self, changed, recordings, counted, write_episode):
-        bad = write_episode(recordings / "Press" / "episode_9", 9, views=("View9",))
-        npz = bad / "sensor_data.npz"
-        npz.write_bytes(npz.read_bytes()[:5000])
-        params = changed(data={"on_bad_episode": "skip"})
-        run(params)
-        assert FeatureStore.open(params.extract.store).streams["views"] == ["View1", "View2"]
         counted.clear()
         shutil.rmtree(bad)
         run(params)
-        assert not counted, "removing it changes no feature"
+        assert not counted, "to remove it changes no feature"
 
     @pytest.mark.usefixtures("extracted")
     def test_stop_stops_beside_a_finished_store_too(self, params, recordings):
@@ -839,20 +755,11 @@ class TestRefusals:
             run(params)
 
     def test_two_embodiments_are_refused_naming_both(
-        self, changed, recordings, tmp_path, monkeypatch, write_episode
+        self, changed, tmp_path, narrower, write_episode
     ):
         other = write_episode(tmp_path / "other" / "Task" / "episode_9", 9).parent.parent
         sources = [{"name": "made", "path": "."}, {"name": "second", "path": str(other)}]
-        real = WindowedRecording.sensor
-
-        def narrower(self):
-            stream = real(self)
-            if self.source != "second" or stream is None:
-                return stream
-            channels = Channels(stream.channels.names[:7], stream.channels.units[:7])
-            return Stream(channels, stream.time, stream.values[:, :7])
-
-        monkeypatch.setattr(WindowedRecording, "sensor", narrower)
+        narrower(other)
         with pytest.raises(
             StoreMismatch, match=r"the sensor of source 'made'.*'second'.*7 channels.*two stores"
         ):

@@ -6,49 +6,31 @@ import numpy as np
 import pytest
 
 from pipeline.base.errors import DiskFull
-from pipeline.extract import extract
 from pipeline.extract.engine import in_background
 from pipeline.extract.rows import RowPreparation
 from pipeline.store import FeatureStore, StoreBuild
 from pipeline.vlm.qwen import FrozenVLM
-
-
-def run(params):
-    return extract(params, lambda line: None)
-
-
-@pytest.fixture
-def asked(monkeypatch) -> list[int]:
-    """How many rows each batch of the model's has."""
-    rows: list[int] = []
-    real = FrozenVLM.submit
-
-    def submit(self, batch):
-        rows.append(len(batch))
-        return real(self, batch)
-
-    monkeypatch.setattr(FrozenVLM, "submit", submit)
-    return rows
+from tests.extract.conftest import run
 
 
 class TestEqualRows:
     def test_are_computed_once_and_the_store_is_the_same(
-        self, params, changed, recordings, asked, stand_still, monkeypatch
+        self, params, changed, recordings, counted, stand_still, monkeypatch
     ):
         for episode in ("episode_1", "episode_2"):
             stand_still(recordings / "Touch_dot" / episode)
-        report = run(params)
+        report = run(params)[0]
         store = FeatureStore.open(params.extract.store)
         keys = [bytes(key) for key in store.array("vl/key")]
         assert len(set(keys)) < len(keys) - 10
-        assert sum(asked) == report.computed == len(set(keys))
+        assert sum(counted) == report.computed == len(set(keys))
         assert report.repeated == len(keys) - len(set(keys))
         other = changed(extract={"store": str(params.extract.store.with_name("each.zarr"))})
         prepare = RowPreparation.prepare
         monkeypatch.setattr(
             RowPreparation, "prepare", lambda self, rows, firsts: prepare(self, rows, None)
         )
-        assert run(other).computed == len(keys)
+        assert run(other)[0].computed == len(keys)
         each = FeatureStore.open(other.extract.store)
         assert [bytes(key) for key in each.array("vl/key")] == keys
         assert np.allclose(store.array("vl/features"), each.array("vl/features"), atol=2e-5)
@@ -64,8 +46,8 @@ class TestEqualRows:
 
         with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
             patch.setattr(StoreBuild, "mark", mark)
-            run(params)
-        report = run(params)
+            run(params)[0]
+        report = run(params)[0]
         assert report.taken == 0
         assert report.computed + report.repeated == report.rows - params.extract.batch_size
 
@@ -80,19 +62,19 @@ class TestCommits:
             real(self, numbers, *rest)
 
         monkeypatch.setattr(StoreBuild, "mark", mark)
-        report = run(params)
+        report = run(params)[0]
         assert len(threads) == 1
         assert threads.pop().startswith("commit")
         assert sorted(rows) == list(range(report.rows))
 
-    def test_a_failure_stops_the_model_at_once(self, params, asked, monkeypatch):
+    def test_a_failure_stops_the_model_at_once(self, params, counted, monkeypatch):
         def mark(self, *args):
             raise DiskFull("no room at all")
 
         monkeypatch.setattr(StoreBuild, "mark", mark)
         with pytest.raises(DiskFull, match="no room at all"):
-            run(params)
-        assert len(asked) <= 4
+            run(params)[0]
+        assert len(counted) <= 4
         assert not [one for one in threading.enumerate() if one.name.startswith("commit")]
 
     def test_what_is_computed_is_kept_when_the_model_fails(self, params, monkeypatch):
@@ -106,13 +88,13 @@ class TestCommits:
 
         with monkeypatch.context() as patch, pytest.raises(RuntimeError, match="fell off"):
             patch.setattr(FrozenVLM, "submit", submit)
-            run(params)
-        report = run(params)
+            run(params)[0]
+        report = run(params)[0]
         assert report.computed == report.rows - sum(calls[:3])
 
 
 def test_the_report_says_how_the_time_was_spent(params):
-    _, model, waited = run(params).speed
+    _, model, waited = run(params)[0].speed
     assert 0 < model <= 1
     assert 0 <= waited < 1
     assert model + waited <= 1

@@ -12,14 +12,14 @@ from pathlib import Path
 from typing import Any
 
 import google_crc32c
-import numpy as np
 import pytest
 import yaml
 
 from pipeline.base.config import Params
 from pipeline.extract import extract
-from pipeline.store import FeatureStore, StoreBuild, part_path, read_plan
-from pipeline.store.schema import ARRAY_NAMES, read_specs
+from pipeline.extract.state import StorePlaces
+from pipeline.store import FeatureStore, part_path
+from tests.extract.conftest import assert_same
 
 BATCH = 2
 IN_FLIGHT = 3
@@ -101,7 +101,6 @@ def killed_runs(
         sessions.append(Killed(computed_of(log) - computed, marked_of(store) - marked, midway))
     before = marked_of(store)
     report = extract(Params.model_validate(document_of(document, store)), lambda line: None)
-    assert report is not None
     assert report.computed == report.rows - before, "just what was missing is computed"
     return store, sessions
 
@@ -127,12 +126,12 @@ def computed_of(log: Path) -> int:
 
 def marked_of(store: Path) -> int:
     """Rows of the build that count as done."""
-    part = part_path(store)
     if store.exists():
         return len(FeatureStore.open(store).array("vl/time"))
-    if not (part / "zarr.json").exists() or (plan := read_plan(part)) is None:
+    places = StorePlaces(store)
+    if places.begun is None:
         return 0
-    with closing(StoreBuild(store, read_specs(part), plan)) as build:
+    with closing(places.begun_build()) as build:
         return build.specs["vl/time"].shape[0] - len(build.missing())
 
 
@@ -151,14 +150,10 @@ def undisturbed(document, tmp_path_factory) -> FeatureStore:
 
 
 def assert_equal_stores(found: FeatureStore, expected: FeatureStore) -> None:
-    """Everything but the features exactly, those within the noise of float32."""
-    for name in set(ARRAY_NAMES) - {"vl/features", "vl/checksum"}:
-        assert np.array_equal(found.array(name), expected.array(name), equal_nan=True), name
-    assert np.allclose(found.array("vl/features"), expected.array("vl/features"), atol=2e-5)
+    assert_same(found, expected)
     for row, checksum in zip(found.array("vl/features"), found.array("vl/checksum"), strict=True):
         assert checksum == (google_crc32c.value(row.tobytes()) or 1)
-    ours, theirs = dict(found.attrs), dict(expected.attrs)
-    assert ours == theirs
+    assert dict(found.attrs) == dict(expected.attrs)
 
 
 @pytest.mark.parametrize(

@@ -35,7 +35,6 @@ def test_a_merged_store_gives_every_row_to_an_extraction_of_all_sources(
 
     monkeypatch.setattr(FrozenVLM, "load", refuse)
     report = extract(changed(data={"sources": sources}, extract={"store": str(target)}), print)
-    assert report is not None
     assert (report.computed, report.taken) == (0, report.rows)
     after = FeatureStore.open(target)
     assert after.sources == ["first", "second"]

@@ -11,8 +11,9 @@ from PIL import Image
 from pipeline.base.config import Params
 from pipeline.base.errors import StoreMismatch
 from pipeline.extract import extract
-from pipeline.extract.reextract import Deviation, Reextraction, reextract
+from pipeline.extract.reextract import Reextraction, reextract
 from pipeline.store.schema import chunk_paths, read_spec
+from pipeline.vlm.qwen import FrozenVLM
 from pipeline.vlm.slots import TOLERANCES
 
 
@@ -67,12 +68,6 @@ class TestSoundStore:
         assert not found.environment
         assert "computed 24 rows again" in found.lines()[0]
 
-    def test_variants_in_several_batches(self, document):
-        document["extract"] = document["extract"] | {"batch_size": 1}
-        found = again(document, rows=10)
-        assert len(found.deviations) == 10
-        assert not found.beyond
-
     def test_the_choice_goes_by_the_seed(self, document):
         def rows(seed: int) -> set[int]:
             return {one.row for one in again(document, rows=4, seed=seed).deviations}
@@ -114,16 +109,9 @@ class TestDeviations:
         assert not any(one.same_pixels for one in found.deviations)
         assert "the decoder of today gives other pixels" in "\n".join(found.lines())
 
-    def test_what_a_slot_of_zeros_deviates(self):
-        none = Deviation(0, 0.0, 0.0, 0, True, "here")
-        some = Deviation(1, 1.0, np.inf, 0, True, "there")
-        assert Reextraction((some, none), 1e-3, (), ()).beyond == [some]
-
 
 class TestOtherThanTheStore:
     def test_environments_are_compared(self, document, monkeypatch):
-        from pipeline.vlm.qwen import FrozenVLM
-
         load = FrozenVLM.load.__func__
 
         def elsewhere(cls, *args, **kwargs):

@@ -15,6 +15,7 @@ from pipeline.store import FeatureStore, StoreBuild, part_path, read_plan
 from pipeline.store.chunks import write_seal
 from pipeline.store.schema import chunk_paths, read_spec, read_specs
 from pipeline.store.verification import verify
+from tests.extract.conftest import contents
 from tests.faults.killing import killed_before
 
 ROW_BYTES = 3 * 8 * 4
@@ -38,14 +39,6 @@ def flip(path: Path, byte: int) -> None:
     content = bytearray(path.read_bytes())
     content[byte] ^= 0x40
     path.write_bytes(content)
-
-
-def contents(store: Path) -> dict[str, bytes]:
-    return {
-        path.relative_to(store).as_posix(): path.read_bytes()
-        for path in store.rglob("*")
-        if path.is_file()
-    }
 
 
 def repaired(store: Path) -> StoreBuild:
@@ -83,8 +76,6 @@ DAMAGES: list[tuple[str, Callable[[Path], object], list[int]]] = [
     ("vl/features", Path.unlink, EVERY_ROW),
     ("vl/features", lambda path: flip(path, 4096 * ROW_BYTES), []),  # the trailer alone
     ("vl/key", lambda path: flip(path, 5), EVERY_ROW),
-    ("vl/key", Path.unlink, EVERY_ROW),
-    ("vl/checksum", lambda path: flip(path, 4 * 9), []),
     ("vl/checksum", Path.unlink, []),
 ]
 
@@ -167,7 +158,7 @@ def test_a_kill_at_any_step_leaves_the_store_and_a_repair_to_be_started_again(or
         (Path, "rename"),
         (shutil, "copyfile"),
     ]
-    for kill_at in range(0, 200, 3):
+    for kill_at in range(0, 200, 5):
         store = Path(shutil.copytree(original, tmp_path / str(kill_at) / "tiny.zarr"))
         flip_row_17(chunk_file(store, "vl/features"))
         damaged, builds = contents(store), list[StoreBuild]()

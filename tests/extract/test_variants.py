@@ -9,16 +9,11 @@ import pytest
 from pipeline.base.config import Params
 from pipeline.base.errors import DiskFull
 from pipeline.base.text import size
-from pipeline.extract import extract
 from pipeline.store import FeatureStore, StoreBuild
 from pipeline.store.schema import ARRAY_NAMES
+from tests.extract.conftest import run
 
 K = 3
-
-
-def run(params) -> tuple[object, list[str]]:
-    said: list[str] = []
-    return extract(params, said.append), said
 
 
 def features_by_key(store: FeatureStore) -> dict[bytes, np.ndarray]:
@@ -71,6 +66,7 @@ class TestWhatItWrites:
         seen = store.array("vl/slot_valid")[:, : store.feature_shape[0]].astype(bool)
         for a, b in ((0, 1), (0, 2), (1, 2)):
             assert (np.abs(variants[a] - variants[b]).max(axis=-1)[seen] > 1e-3).all()
+        assert not features_by_key(plain).keys() & features_by_key(store).keys()
 
     def test_slots_are_named_variant_after_variant(self, extracted):
         plain, store = extracted[1].attrs["slots"], extracted[K].attrs["slots"]
@@ -87,16 +83,6 @@ class TestWhatItWrites:
         assert not batch.features[:, view1].any()
         assert batch.slot_valid[:, np.logical_not(view1)].all()
         assert len({row.numpy().tobytes() for row in batch.features}) == K
-
-    def test_the_keys_are_not_those_of_one_variant(self, extracted):
-        one, several = (set(map(bytes, store.array("vl/key"))) for store in extracted.values())
-        assert not one & several
-
-    def test_without_a_camera_there_is_nothing_to_augment(self, varied):
-        params = varied(data={"views": []}, vlm={"pooling": ["mean"]})
-        run(params)
-        variants = by_variant(FeatureStore.open(params.extract.store))
-        assert np.allclose(variants[0], variants[1], atol=2e-5)
 
 
 def test_neither_batch_nor_threads_nor_order_nor_episode_decide_a_variant(
@@ -118,21 +104,6 @@ class TestWhatItTakesOver:
         _, said = run(changed(vlm={"variants": 2}, extract={"plan": True}))
         assert any("feature spec, variants: null -> 2" in line for line in said)
         assert any("rows: 24, 0 known, 24 to compute in 2 variants" in line for line in said)
-
-    def test_an_added_episode_computes_only_its_rows(
-        self, extracted, varied, recordings, write_episode
-    ):
-        params = varied()
-        shutil.copytree(extracted[K].path, params.extract.store)
-        write_episode(recordings / "Touch_dot" / "episode_0", 9)
-        report, _ = run(params)
-        store = FeatureStore.open(params.extract.store)
-        (added,) = (one for one in store.episodes if one.id == "episode_0")
-        assert report.computed == len(added.vl_rows)
-        assert report.taken == 24
-        found = features_by_key(store)
-        for key, features in features_by_key(extracted[K]).items():
-            assert np.array_equal(found[key], features)
 
     def test_an_interrupted_build_goes_on(self, extracted, varied, monkeypatch):
         params = varied(extract={"batch_size": 2 * K})

@@ -73,9 +73,9 @@ def _ridge_r2(features, places):
 
 def test_grid_finds_a_disc_and_mean_does_so_less(extractor):
     eye = extractor(views=("View1",), pooling=["mean", "grid"])
-    places = np.random.default_rng(0).uniform(0.12, 0.88, (320, 2))
+    places = np.random.default_rng(0).uniform(0.12, 0.88, (160, 2))
     rows = [eye.preparer.prepare("insert", {"View1": _disc(x, y)}) for x, y in places]
-    features = torch.cat([eye.model.encode(rows[i : i + 40])[0] for i in range(0, 320, 40)])
+    features = torch.cat([eye.model.encode(rows[i : i + 40])[0] for i in range(0, 160, 40)])
     table = features.numpy().astype(np.float64)
     mean = _ridge_r2(table[:, 0], places)
     grid = _ridge_r2(table[:, 1:].reshape(len(table), -1), places)

@@ -159,9 +159,8 @@ def test_lora_stands_on_every_linear_layer_that_runs(prepare):
     assert all(3 in parameter.shape for parameter in _learning(live).values())
 
 
-@pytest.mark.parametrize("dtype", ["float32", pytest.param("bfloat16", marks=pytest.mark.slow)])
-def test_a_saved_adapter_makes_the_frozen_model_the_live_one(prepare, tmp_path, dtype):
-    frozen, rows, before = prepare(dtype, dtype=dtype, layers=[2])
+def test_a_saved_adapter_makes_the_frozen_model_the_live_one(prepare, tmp_path):
+    frozen, rows, before = prepare(layers=[2])
     live = _live(frozen, lora_r=4, lora_alpha=8)
     _stir(live)
     live.save(tmp_path / "adapter")
@@ -173,17 +172,12 @@ def test_a_saved_adapter_makes_the_frozen_model_the_live_one(prepare, tmp_path, 
     assert config["base_model_name_or_path"] == frozen.vlm.checkpoint
     assert (config["peft_type"], config["r"], config["lora_alpha"]) == ("LORA", 4, 8)
 
-    tuned, _, after = prepare(dtype, dtype=dtype, layers=[2], adapter=str(tmp_path / "adapter"))
+    tuned, _, after = prepare(layers=[2], adapter=str(tmp_path / "adapter"))
     assert tuned.spec.digest != frozen.spec.digest
     with torch.no_grad():
         features, valid = live.eval()(rows)
-    moved = _relative(after.float(), before.float())[valid].mean()
-    if dtype == "float32":
-        torch.testing.assert_close(features, after, atol=5e-5, rtol=1e-4)
-        assert moved > 0.05
-    else:
-        assert _relative(features, after.float())[valid].max() < BF16_TOLERANCE
-        assert moved > 2 * _relative(features, after.float())[valid].mean()
+    torch.testing.assert_close(features, after, atol=5e-5, rtol=1e-4)
+    assert _relative(after, before)[valid].mean() > 0.05
 
 
 def test_the_same_adapter_is_the_same_file(prepare, tmp_path):

@@ -15,7 +15,9 @@ from torch import Tensor
 from transformers import Qwen2_5_VLForConditionalGeneration
 
 from pipeline.base.config import VLMParams
+from pipeline.base.digests import file_digest
 from pipeline.base.errors import ConfigError, VLMError
+from pipeline.vlm.feature_spec import feature_spec
 from pipeline.vlm.loading import load_model
 from pipeline.vlm.processor import PixelSettings, PromptRenderer
 
@@ -257,15 +259,15 @@ def make_adapter(demo_checkpoint):
     return make
 
 
-def test_an_adapter_changes_features_and_identity(encode, extractor, make_adapter, tmp_path):
+def test_an_adapter_changes_features_and_identity(encode, make_adapter, vlm_params, tmp_path):
     base = encode()
     nothing = make_adapter(tmp_path / "zeros", 0.0)
     torch.testing.assert_close(encode(adapter=str(nothing)), base)
     strong = make_adapter(tmp_path / "strong", 0.1)
     changed = encode(adapter=str(strong))
     assert (changed - base).norm() > 0.05 * base.norm()
-    digests = {extractor(adapter=a).spec.digest for a in (None, str(nothing), str(strong))}
-    assert len(digests) == 3
+    every = (vlm_params(adapter=adapter) for adapter in (None, str(nothing), str(strong)))
+    assert len({feature_spec(vlm, "float32", (), file_digest).digest for vlm in every}) == 3
 
 
 def test_an_adapter_is_what_peft_makes_of_it(extractor, make_adapter, demo_checkpoint, tmp_path):
