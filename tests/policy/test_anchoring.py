@@ -148,8 +148,10 @@ def test_older_readings_tell_the_motion_and_nothing_else(build_policy, observe):
     )
 
 
+@pytest.mark.slow  # torch.export
 def test_an_exported_head_counts_likewise(build_policy, observe, shape):
-    policy = build_policy().eval()
+    small = {"dim": 8, "layers": 1, "heads": 2, "dropout": 0.0}
+    policy = build_policy(sensor_enabled=False, fusion_strategy="none", expert=small).eval()
     policy.anchoring = Anchoring((Anchor((0, 1), (3, 4)),), shape.kinds)
     head = Head(policy).requires_grad_(False)
     fields = {name: getattr(observe(2), name) for name in Observation.__dataclass_fields__}

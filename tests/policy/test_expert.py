@@ -295,6 +295,13 @@ def test_several_draws_are_a_batch_that_repeats(kind):
     drawn = [torch.Generator().manual_seed(1) for _ in range(2)]
     loss, _ = expert.loss(context, actions, valid, drawn[0])
     expert.draws = 1
+    guess = expert.direct(context.mean(dim=1)).unflatten(-1, (4, 3))
+    drawn_alone = expert.drawn_loss(
+        context, actions.masked_fill(~valid[..., None], 0.0), valid, seeded(1)
+    )[0]
+    whole = expert.loss(context, actions, valid, seeded(1))[0]
+    half = expert.grouped(guess, actions, valid)[0] / 2
+    torch.testing.assert_close(whole, drawn_alone + half)
     alike = [x.repeat(3, *[1] * (x.ndim - 1)) for x in (context, actions, valid)]
     torch.testing.assert_close(expert.loss(*alike, drawn[1])[0], loss)
     assert not loss.isclose(expert.loss(context, actions, valid, drawn[1])[0])

@@ -3,7 +3,6 @@
 import pytest
 import torch
 
-from pipeline.policy.encoders import FeatureEncoder
 from pipeline.policy.fusion import CrossAttentionFusion, GatedFusion, NoFusion, build_fusion
 
 DIM, HEADS = 16, 2
@@ -54,14 +53,6 @@ class TestFusionContract:
                 moved = (fusion(encoded | {name: changed}) - context).abs()
                 assert moved.amax(dim=(1, 2)).min() > 1e-3, (name, token)
 
-    def test_gradient_reaches_every_weight_and_every_token(self, fusion, encoded):
-        encoded = {name: tokens.requires_grad_() for name, tokens in encoded.items()}
-        context = fusion(encoded)
-        (context * torch.randn_like(context)).sum().backward()
-        for name, tensor in [*fusion.named_parameters(), *encoded.items()]:
-            assert tensor.grad is not None, name
-            assert tensor.grad.abs().max() > 0, name
-
     def test_no_stream_drowns_the_others_by_its_scale(self, fusion, encoded, strategy):
         """Where several tokens are projected together, what counts is their mean and bias."""
         context = fusion(encoded)
@@ -71,25 +62,6 @@ class TestFusionContract:
             assert (loud - context).abs().max() < 2.0
             if name != "features" or strategy in ("cross_attention", "none"):
                 torch.testing.assert_close(loud, context, atol=1e-3, rtol=1e-3)
-
-    def test_bf16_autocast_is_near_float32(self, fusion, encoded):
-        exact = fusion(encoded)
-        with torch.autocast("cpu", dtype=torch.bfloat16):
-            rough = fusion(encoded)
-        torch.testing.assert_close(rough.float(), exact, atol=0.06, rtol=0.06)
-
-
-def test_what_stands_in_an_invalid_slot_never_reaches_the_context(strategy):
-    """The features' mask ends in the encoder, as an embedding that every fusion can see."""
-    encoder = FeatureEncoder(5, 16)
-    fusion = build_fusion(strategy, {"features": (5, encoder.width)}, DIM, HEADS)
-    features, age = torch.randn(2, 5, 16), torch.rand(2)
-    valid = torch.tensor([[True, False, True, False, True], [False] * 5])
-    changed = features.masked_fill(~valid.unsqueeze(-1), torch.nan)
-    context = fusion({"features": encoder(features, valid, age)})
-    assert torch.equal(fusion({"features": encoder(changed, valid, age)}), context)
-    seen = fusion({"features": encoder(features, torch.ones_like(valid), age)})
-    assert (seen - context).abs().amax(dim=(1, 2)).min() > 1e-2
 
 
 class TestGates:

@@ -21,14 +21,17 @@ def weights(trainer: Trainer) -> list[torch.Tensor]:
 
 
 @pytest.mark.parametrize(
-    ("model_type", "accumulation"), [("regression", 3), ("diffusion", 1), ("flow_matching", 2)]
+    "model_type",
+    [
+        "diffusion",
+        pytest.param("regression", marks=pytest.mark.slow),
+        pytest.param("flow_matching", marks=pytest.mark.slow),
+    ],
 )
-def test_every_step_can_be_gone_on_from(
-    store, params, trainer, tmp_path, monkeypatch, model_type, accumulation
-):
+def test_every_step_can_be_gone_on_from(store, params, trainer, tmp_path, monkeypatch, model_type):
     chosen = {
         "model_type": model_type,
-        "grad_accumulation": accumulation,
+        "grad_accumulation": 2,
         "max_steps": STEPS,
         "warmup_steps": 2,
         "eval_every": 2,

@@ -72,7 +72,7 @@ def test_episodes_are_known_by_content_and_a_group_is_known_whole(tuned_store):
 
 
 def test_a_recording_cut_by_time_may_be_on_all_sides(tuned_store):
-    store = tuned_store(TunedOn(train=(part(0, (0, 18)),), val=(part(0, (20, 24)),)), episodes=1)
+    store = tuned_store(TunedOn(train=(part(0, (0, 20)),), val=(part(0, (20, 26)),)), episodes=1)
     split = split_by_episode(store, SplitParams(), horizon=3)
     assert refuse_tuned_episodes(store, split) == []
     earlier = split_by_episode(store, SplitParams(test=0.3), horizon=3)
