@@ -28,14 +28,17 @@ class Refuse:
         if name.partition(".")[0] not in allowed:
             raise ImportError(f"{name} is not on the robot's computer")
 
-sys.meta_path.insert(0, Refuse())
-from pipeline.robot.chunking import Executor
+sys.meta_path.insert(0, refuse := Refuse())
 from pipeline.robot.client import PolicyClient
+from pipeline.robot.loop import Executor
 print(sorted({name.partition(".")[0] for name in sys.modules} & {"numpy", "msgpack", "websockets"}))
+sys.meta_path.remove(refuse)
+import pipeline.robot.lerobot_arm, pipeline.robot.realtime, pipeline.robot.recorder
+print("torch" in sys.modules)
 """
 
 
-def test_it_needs_numpy_msgpack_and_websockets_alone() -> None:
+def test_it_needs_numpy_msgpack_and_websockets_alone_and_running_a_robot_no_torch() -> None:
     """And so does the executor, which plays what it gets."""
     done = subprocess.run(
         [sys.executable, "-W", "error", "-c", LIGHT],
@@ -45,7 +48,7 @@ def test_it_needs_numpy_msgpack_and_websockets_alone() -> None:
         env=os.environ | {"PYTHONPATH": str(ROOT)},
     )
     assert done.returncode == 0, done.stderr
-    assert done.stdout == "['msgpack', 'numpy', 'websockets']\n"
+    assert done.stdout == "['msgpack', 'numpy', 'websockets']\nFalse\n"
 
 
 def test_a_reset_goes_with_the_next_observation(
@@ -64,7 +67,7 @@ def test_a_reset_goes_with_the_next_observation(
 def test_a_refused_observation_says_why_and_the_client_can_begin_again(
     served_policy: Callable[..., Any], serving: Callable[..., Any], observe: Observe
 ) -> None:
-    with PolicyClient(f"ws://{serving(served_policy()).address}") as client:
+    with PolicyClient(serving(served_policy()).address) as client:
         with pytest.raises(ObservationError, match=r"^sensors: expected one of.* sensor"):
             client.infer(observe(0, sensors=np.zeros(3)))
         with pytest.raises(ServerError, match="not connected; call reconnect"):
@@ -73,29 +76,16 @@ def test_a_refused_observation_says_why_and_the_client_can_begin_again(
         assert client.infer(observe(0))["actions"].shape == (4, 7)
 
 
-def test_nobody_listens() -> None:
-    with socket.create_server(("127.0.0.1", 0)) as taken:
-        port = taken.getsockname()[1]
+def test_nobody_listens_or_something_else_does() -> None:
+    """What takes the connection and says nothing, among it."""
+    with socket.create_server(("127.0.0.1", 0)) as silent:
+        port = silent.getsockname()[1]
+        with pytest.raises(ServerError, match=r"nobody serves a policy there .timed out"):
+            PolicyClient(f"ws://127.0.0.1:{port}", timeout_s=0.1)
     with pytest.raises(ServerError, match=r"nobody serves a policy there.*Start python -m stages"):
-        PolicyClient(f"ws://127.0.0.1:{port}")
-    with pytest.raises(ServerError, match="nobody serves a policy there"):
-        PolicyClient("ws://no.such.invalid:1")
-
-
-def test_an_address_without_a_scheme_is_a_websockets(
-    served_policy: Callable[..., Any], serving: Callable[..., Any]
-) -> None:
-    with PolicyClient(serving(served_policy()).address) as client:
-        assert client.metadata["protocol"] == 1
-
-
-def test_something_else_listens() -> None:
-    """It takes the connection and says nothing."""
-    with (
-        socket.create_server(("127.0.0.1", 0)) as silent,
-        pytest.raises(ServerError, match=r"nobody serves a policy there .timed out"),
-    ):
-        PolicyClient(f"ws://127.0.0.1:{silent.getsockname()[1]}", timeout_s=0.2)
+        PolicyClient(f"127.0.0.1:{port}")
+    with pytest.raises(ServerError, match="expected an address such as ws://"):
+        PolicyClient("http://127.0.0.1:1")
 
 
 def test_a_late_answer_is_never_taken_for_the_next(
@@ -140,13 +130,9 @@ METADATA = {
 @pytest.mark.parametrize(
     ("robot", "said"),
     [
-        (
-            {"state": ["b", "a", "c"]},
-            'state: ["a", "b", "c"] in training, the robot\'s ["b", "a", ',
-        ),
+        ({"state": ["b", "a", "c"]}, 'state: ["a", "b", "c"] in training, the robot\'s ["b"'),
         ({"state_units": ["deg", "rad", "mm"]}, 'state_units: ["deg", "deg", "mm"] in training'),
         ({"action_kind": "absolute"}, 'action_kind: "delta" in training, the robot\'s "absolute"'),
-        ({"sensor": ["s"]}, 'sensor: [] in training, the robot\'s ["s"]'),
         ({"views": ["View2"]}, 'views: ["View1", "View2"] in training, the robot\'s ["View2"]'),
         ({"action_hz": 30}, "action_hz: 10.0 in training, the robot's 30"),
         ({"camera": ["View1"]}, "the robot's description: expected views, "),

@@ -26,12 +26,13 @@ from pipeline.robot import export
 from pipeline.robot.export import (
     ExportedHead,
     Head,
+    count_draws,
     export_head,
     onnx_runner,
+    random_inputs,
     torch_runner,
     trace,
 )
-from pipeline.robot.export_inputs import count_draws, random_inputs
 
 GROUPS = ("translation", "translation", "rotation")
 SHAPE = PolicyShape(

@@ -102,6 +102,15 @@ def opened(folder: Path) -> Recording:
     return recording
 
 
+def end_of(path: Path) -> dict[str, Any]:
+    return json.loads((path / "run.json").read_text())
+
+
+def shades(camera: Any) -> list[int]:
+    """The first pixel of each of its frames."""
+    return [frame[0, 0, 0] for frame in camera.read(range(len(camera.time)))]
+
+
 @pytest.fixture(scope="module")
 def vlm(demo_checkpoint: Path) -> dict[str, Any]:
     size = {"image_resize_height": 56, "image_resize_width": 56}
@@ -144,7 +153,7 @@ def run(vlm: dict[str, Any], live, tmp_path_factory: pytest.TempPathFactory):
     return driven, path, FeatureStore.open(folder / "runs.zarr")
 
 
-def test_a_run_comes_back_as_it_was(run) -> None:
+def test_a_run_comes_back_as_it_was_and_says_how_it_ended(run) -> None:
     driven, path, _ = run
     recording = opened(path)
     action, start = recording.action(), driven.time[0]
@@ -163,6 +172,17 @@ def test_a_run_comes_back_as_it_was(run) -> None:
         for (_, shot), frame in zip(shots, read, strict=True):
             np.testing.assert_array_equal(frame, shot)
     assert (recording.instruction, sorted(recording.cameras())) == (INSTRUCTION, list(VIEWS))
+    said = end_of(path)
+    assert (said["reason"], said["settings"]) == ("inserted", {"execute": 1})
+    assert said["timings"] == {"tick_ms": {"p50": 1.5}}
+    assert said["rows"] == said["ticks"] == len(driven.sent)
+    assert (said["start_s"], said["dropped_images"]) == (driven.time[0], 0)
+    assert not list(path.parent.glob("*.part"))
+    with np.load(path / "features" / "episode_000000.npz") as features:
+        assert features["key"].shape == (len(driven.sent), 16)
+        assert features["answer"].tolist() == [1 + k // REUSE for k in range(len(driven.sent))]
+        assert features["age_s"][0] == np.float32(0.05)
+        assert features["feature_spec_digest"] == [said["metadata"]["feature_spec_digest"]]
 
 
 def test_a_store_of_a_run_has_its_actions_its_clocks_and_the_robots_keys(run) -> None:
@@ -179,21 +199,6 @@ def test_a_store_of_a_run_has_its_actions_its_clocks_and_the_robots_keys(run) ->
     assert compare_keys(path, store) == same
 
 
-def test_the_run_says_how_it_was_and_ended(run) -> None:
-    driven, path, _ = run
-    said = json.loads((path / "run.json").read_text())
-    assert (said["reason"], said["settings"]) == ("inserted", {"execute": 1})
-    assert said["timings"] == {"tick_ms": {"p50": 1.5}}
-    assert said["rows"] == said["ticks"] == len(driven.sent)
-    assert (said["start_s"], said["dropped_images"]) == (driven.time[0], 0)
-    assert not list(path.parent.glob("*.part"))
-    with np.load(path / "features" / "episode_000000.npz") as features:
-        assert features["key"].shape == (len(driven.sent), 16)
-        assert features["answer"].tolist() == [1 + k // REUSE for k in range(len(driven.sent))]
-        assert features["age_s"][0] == np.float32(0.05)
-        assert features["feature_spec_digest"] == [said["metadata"]["feature_spec_digest"]]
-
-
 def test_late_answers_leave_out_the_ticks_before_the_first_action(live, vlm, tmp_path) -> None:
     spec, key_of = live
     driven = drive(tmp_path / "runs", told(spec), key_of, late=2, ticks=12)
@@ -206,26 +211,26 @@ def test_late_answers_leave_out_the_ticks_before_the_first_action(live, vlm, tmp
     assert len(store.array("state/time")) == 120
 
 
-@pytest.mark.parametrize("stream", ["state", "sensor"])
-def test_a_stream_that_the_policy_lacks_is_not_recorded(tmp_path: Path, stream: str) -> None:
-    metadata = metadata_of(**{stream: {"names": [], "units": []}})
-    path = drive(tmp_path, metadata, no_key, ticks=5).recorder.finish("done")
-    recording = opened(path)
-    streams = {"state": recording.state(), "sensor": recording.sensor()}
-    assert [name for name, found in streams.items() if found is None] == [stream]
-
-
 def observed_at(tick: int, **readings: Any) -> dict[str, Any]:
     return {"time": np.array([5 + tick / 10]), **readings}
+
+
+def state_at(tick: int, value: float = 1.0) -> dict[str, Any]:
+    return {"state": np.full((1, 12), value), "state_time": np.array([5 + tick / 10])}
 
 
 def image_of(shade: int) -> np.ndarray:
     return np.full((6, 8, 3), shade, np.uint8)
 
 
-def test_a_policy_without_any_stream_is_recorded_by_its_actions(tmp_path: Path) -> None:
-    none: dict[str, Any] = {"names": [], "units": []}
-    recorder = RunRecorder(tmp_path, metadata_of(state=none, sensor=none, views=[]), "Push")
+NONE: dict[str, Any] = {"names": [], "units": []}
+
+
+def test_streams_that_the_policy_lacks_are_not_recorded(tmp_path: Path) -> None:
+    path = drive(tmp_path, metadata_of(sensor=NONE), no_key, ticks=5).recorder.finish("done")
+    recording = opened(path)
+    assert recording.sensor() is None and recording.state() is not None
+    recorder = RunRecorder(tmp_path, metadata_of(state=NONE, sensor=NONE, views=[]), "Push")
     for tick in range(4):
         recorder.tick(observed_at(tick), np.full(7, tick))
     recording = opened(recorder.finish("done"))
@@ -234,27 +239,19 @@ def test_a_policy_without_any_stream_is_recorded_by_its_actions(tmp_path: Path) 
     assert recording.state() is None and not recording.cameras()
 
 
-def test_a_view_that_never_came_is_missing(tmp_path: Path) -> None:
-    recorder = RunRecorder(tmp_path, metadata_of(), "Push")
-    for tick in range(4):
-        recorder.frames({VIEWS[1]: (5 + tick / 10, image_of(tick)), "Side": (5.0, image_of(9))})
-        recorder.tick(observed_at(tick), np.zeros(7))
-    cameras = opened(recorder.finish("done")).cameras()
-    assert list(cameras) == [VIEWS[1]]
-    assert [frame[0, 0, 0] for frame in cameras[VIEWS[1]].read(range(4))] == [0, 1, 2, 3]
-
-
-def test_rows_begin_when_all_streams_have(tmp_path: Path) -> None:
+def test_rows_begin_when_all_streams_have_and_a_view_that_never_came_is_missing(
+    tmp_path: Path,
+) -> None:
     recorder = RunRecorder(tmp_path, metadata_of(), "Push")
     for tick in range(6):
-        state = {"state": np.ones((1, 12)), "state_time": np.array([5 + tick / 10])}
         if tick == 3:
-            recorder.frames({"View1": (5.3, image_of(7))})
-        recorder.tick(observed_at(tick, **(state if tick else {})), np.full(7, tick))
+            recorder.frames({"View1": (5.3, image_of(7)), "Side": (5.3, image_of(9))})
+        recorder.tick(observed_at(tick, **(state_at(tick) if tick else {})), np.full(7, tick))
     path = recorder.finish("done")
-    action = opened(path).action()
+    recording = opened(path)
+    action = recording.action()
     assert action is not None and action.values[:, 0].tolist() == [3, 4, 5]
-    assert json.loads((path / "run.json").read_text())["start_s"] == 5.3
+    assert end_of(path)["start_s"] == 5.3 and list(recording.cameras()) == ["View1"]
 
 
 def test_a_frame_is_no_newer_than_the_tick_that_it_came_with(tmp_path: Path) -> None:
@@ -266,21 +263,21 @@ def test_a_frame_is_no_newer_than_the_tick_that_it_came_with(tmp_path: Path) -> 
         recorder.tick(observed_at(tick), np.zeros(7))
     camera = opened(recorder.finish("done")).cameras()["View1"]
     np.testing.assert_allclose(camera.time, [0, 0.2])
-    assert [frame[0, 0, 0] for frame in camera.read([0, 1, 1])] == [0, 2, 2]
+    assert shades(camera) == [0, 2]
 
 
 def test_equal_images_are_stored_once(tmp_path: Path) -> None:
     sizes: list[int] = []
     noise = np.random.default_rng(0).integers(0, 256, (80, 100, 3), np.uint8)
-    for looks, images in (([0], 1), (range(50), 1), (range(0, 50, 3), 4), (range(50), 50)):
+    for looks, images in ((range(20), 1), (range(0, 20, 3), 4), (range(20), 20)):
         recorder = RunRecorder(tmp_path, metadata_of(), "Push")
-        for tick in range(50):
+        for tick in range(20):
             if tick in looks:
                 recorder.frames({"View1": (5 + tick / 10, np.roll(noise, tick % images))})
             recorder.tick(observed_at(tick), np.zeros(7))
         (data,) = recorder.finish("done").glob("data/*/*.parquet")
         sizes.append(data.stat().st_size)
-    np.testing.assert_allclose(np.array(sizes) / noise.nbytes, [1, 1, 4, 50], rtol=0.15)
+    np.testing.assert_allclose(np.array(sizes) / noise.nbytes, [1, 4, 20], rtol=0.15)
 
 
 def test_readings_that_are_no_numbers_are_left_out_and_counted(tmp_path: Path) -> None:
@@ -296,8 +293,7 @@ def test_readings_that_are_no_numbers_are_left_out_and_counted(tmp_path: Path) -
     found = opened(path).state()
     assert found is not None
     np.testing.assert_array_equal(found.values, state[[0, 3]])
-    said = json.loads((path / "run.json").read_text())
-    assert said["readings_left_out"] == {"state": 4}
+    assert end_of(path)["readings_left_out"] == {"state": 4}
 
 
 def test_images_that_find_no_room_are_dropped_and_counted(tmp_path: Path, monkeypatch) -> None:
@@ -309,8 +305,7 @@ def test_images_that_find_no_room_are_dropped_and_counted(tmp_path: Path, monkey
         return encode_png(image)
 
     monkeypatch.setattr(recorder_module, "encode_png", slow)
-    none: dict[str, Any] = {"names": [], "units": []}
-    metadata = metadata_of(state=none, sensor=none, views=["View1"])
+    metadata = metadata_of(state=NONE, sensor=NONE, views=["View1"])
     recorder = RunRecorder(tmp_path, metadata, "Push")
     recorder.frames({"View1": (5.0, image_of(0))})
     recorder.tick(observed_at(0), np.zeros(7))
@@ -319,10 +314,8 @@ def test_images_that_find_no_room_are_dropped_and_counted(tmp_path: Path, monkey
         recorder.tick(observed_at(tick), np.zeros(7))
     go.set()
     camera = opened(path := recorder.finish("done")).cameras()["View1"]
-    said = json.loads((path / "run.json").read_text())
-    assert (said["rows"], said["dropped_images"]) == (5, 4)
-    assert [frame[0, 0, 0] for frame in camera.read(range(len(camera.time)))] == [0]
-    np.testing.assert_allclose(camera.time, [0.0])
+    assert (end_of(path)["rows"], end_of(path)["dropped_images"]) == (5, 4)
+    assert shades(camera) == [0]
 
 
 def test_a_disk_that_does_not_keep_up_fails_the_recording_not_the_run(
@@ -365,17 +358,15 @@ def test_a_recording_is_one_episode(tmp_path: Path) -> None:
 def test_a_run_that_stops_before_its_first_action_is_recorded(tmp_path: Path) -> None:
     recorder = RunRecorder(tmp_path, metadata_of(), "Push")
     for tick in range(4):
-        state = {"state": np.full((1, 12), tick), "state_time": np.array([5 + tick / 10])}
         if tick == 1:
             recorder.frames({"View1": (5.1, image_of(7))})
-        recorder.tick(observed_at(tick, **state), None)
+        recorder.tick(observed_at(tick, **state_at(tick, tick)), None)
     recorder.tick({"time": np.array([0.0])}, None)  # a clock that stopped the robot
     path = recorder.finish("step of kLeftElbow would be 1.231, at most 0.2")
-    recording = opened(path)
-    state, camera = recording.state(), recording.cameras()["View1"]
+    recording, said = opened(path), end_of(path)
+    state = recording.state()
     assert state is not None and state.values[:, 0].tolist() == [0, 1, 2, 3]
-    assert [frame[0, 0, 0] for frame in camera.read(range(len(camera.time)))] == [7]
-    said = json.loads((path / "run.json").read_text())
+    assert shades(recording.cameras()["View1"]) == [7]
     assert (said["rows"], said["ticks"]) == (3, 5) and said["reason"].startswith("step of")
     with pytest.raises(RecordingError, match="no feature 'action'"):
         recording.action()
@@ -389,42 +380,35 @@ def test_one_observation_that_a_kill_leaves_is_recovered(
 
     recorder = RunRecorder(tmp_path, metadata_of(), "Push")
     recorder.frames({"View1": (5.0, image_of(7))})
-    state = {"state": np.ones((2, 12)), "state_time": np.array([4.9, 5.0])}
-    recorder.tick(observed_at(0, **state), None)
+    recorder.tick(observed_at(0, **state_at(0)), None)
     with monkeypatch.context() as killed, pytest.raises(KeyboardInterrupt):
         killed.setattr(recorder_module, "finish_recording", kill)
         recorder.finish("never said")
     recording = opened(recover(recorder.part))
     found = recording.state()
-    assert found is not None and len(found.time) == 2
+    assert found is not None and len(found.time) == 1
     assert list(recording.cameras()) == ["View1"]
 
 
-def test_a_run_without_an_observation_is_no_recording(tmp_path: Path) -> None:
+def test_a_run_without_an_observation_is_no_recording_and_a_finished_one_not_recovered(
+    tmp_path: Path,
+) -> None:
     recorder = RunRecorder(tmp_path, metadata_of(), "Push")
     with pytest.raises(RecordingError, match="the robot was never observed"):
         recorder.finish("the robot's code failed")
     assert recorder.part.is_dir()
-
-
-def test_a_finished_recording_is_not_recovered(tmp_path: Path) -> None:
+    for name in ("run_000007", "run_000009.part", "else"):
+        (tmp_path / name).mkdir()
     recorder = RunRecorder(tmp_path, metadata_of(), "Push")
     recorder.tick(observed_at(0), np.zeros(7))
     path = recorder.finish("done")
+    assert path == tmp_path / "run_000010", "runs are numbered after those there"
     with pytest.raises(RecordingError, match=r"expected what is left of a run, run_NNNNNN\.part"):
         recover(path)
     assert opened(path).action() is not None
 
 
-def test_runs_are_numbered_after_those_there(tmp_path: Path) -> None:
-    for name in ("run_000007", "run_000009.part", "else"):
-        (tmp_path / name).mkdir()
-    recorder = RunRecorder(tmp_path, metadata_of(), "Push")
-    recorder.tick(observed_at(0), np.zeros(7))
-    assert recorder.finish("done") == tmp_path / "run_000010"
-
-
-@pytest.mark.parametrize("shape", [(1, 1, 3), (37, 51, 3), (480, 640, 3)])
+@pytest.mark.parametrize("shape", [(1, 1, 3), (37, 51, 3)])
 def test_a_png_has_the_very_pixels(tmp_path: Path, shape: tuple[int, ...]) -> None:
     image = np.random.default_rng(0).integers(0, 256, shape, np.uint8)
     file = tmp_path / "frame.png"

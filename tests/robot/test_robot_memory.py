@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.robot.robot_memory import ReadingWindow, RobotMemory, SeenFeatures
+from pipeline.robot.readings import ReadingWindow, RobotMemory, SeenFeatures
 from pipeline.store import FeatureStore
 from pipeline.train.batches import Windows
 

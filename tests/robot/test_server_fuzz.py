@@ -11,7 +11,6 @@ from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from time import monotonic
 from typing import Any
 
 import msgpack
@@ -40,7 +39,7 @@ checkpoint, policy, glance = runpy.run_path(sys.argv[1])["build_policy"]()
 glance.passes = type("Forgetful", (list,), {"append": lambda *_: None})()
 glance.instructions = glance.passes
 params = ServeParams(port=0, max_message_mb=1, max_connections=64)
-served = ServedPolicy(checkpoint, policy, glance, "head", say=lambda line: None)
+served = ServedPolicy(checkpoint, policy, glance, "head")
 server = PolicyServer(served, params, None, listen(params))
 server.run(lambda: print(server.address, flush=True))
 """
@@ -212,17 +211,13 @@ def over_a_websocket(rng: np.random.Generator, address: str, fields: dict[str, A
 
 
 @pytest.mark.parametrize(
-    "messages", [150, pytest.param(10_000, marks=[pytest.mark.slow, pytest.mark.timeout(3000)])]
+    "messages", [100, pytest.param(10_000, marks=[pytest.mark.slow, pytest.mark.timeout(3000)])]
 )
 def test_broken_messages(
-    messages: int,
-    running: Running,
-    observe: Callable[..., dict[str, Any]],
-    capsys: pytest.CaptureFixture[str],
+    messages: int, running: Running, observe: Callable[..., dict[str, Any]]
 ) -> None:
     short = {"sensor": np.zeros((2, 1026), np.float32), "sensor_time": np.array([0.01, 0.02])}
-    fields, refused, began = observe(0, **short), 0, monotonic()
-    warm, served = messages // 10, 0
+    fields, refused, warm = observe(0, **short), 0, messages // 10
     with PolicyClient(f"ws://{running.address}", timeout_s=20) as good:
         before = (0.0, 0)
         for number in range(messages):
@@ -235,17 +230,10 @@ def test_broken_messages(
             if number % 10 == 0:
                 answer = good.infer(observe(number // 10))
                 assert answer["actions"].shape == (4, 7)
-                served += 1
             if number == warm:
                 before = running.held()
         after = running.held()
         good.infer(observe(messages))
-    with capsys.disabled():
-        print(
-            f"\n{messages} messages, {refused} refused, {served} good ones between them, in "
-            f"{monotonic() - began:.0f} s: memory {before[0]:.1f} -> {after[0]:.1f} MB, files "
-            f"{before[1]} -> {after[1]}"
-        )
     assert refused > 0.7 * messages
     assert after[0] < before[0] + GROWTH_MB
     assert after[1] <= before[1] + 8  # strangers that just left

@@ -7,9 +7,8 @@ from contextlib import closing
 import numpy as np
 import pytest
 
-from pipeline.simulation.environment import InsertionEnvironment
+from pipeline.simulation.environment import InsertionEnvironment, SimulatedRobot
 from pipeline.simulation.insertion import INSERTED, TIME_IS_UP
-from pipeline.simulation.realtime import SimulatedRobot
 from pipeline.simulation.rendering import VIEWS
 
 STILL = np.zeros(7)
