@@ -1,7 +1,7 @@
 """The client of the policy server, for the robot's computer: numpy, msgpack and websockets."""
 
 from collections.abc import Mapping
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, ExitStack
 from typing import Any, Final
 
 import numpy as np
@@ -47,6 +47,7 @@ class PolicyClient(AbstractContextManager["PolicyClient"]):
         self._token, self._robot, self._timeout_s = token, robot or {}, timeout_s
         self._reset: bool | int | None = None
         self._connection: ClientConnection | None = None
+        self._leaving = ExitStack()
         self.reconnect()
 
     def reconnect(self) -> None:
@@ -85,9 +86,8 @@ class PolicyClient(AbstractContextManager["PolicyClient"]):
 
     def close(self) -> None:
         """Leave the server."""
-        leaving, self._connection = self._connection, None
-        if leaving is not None:
-            leaving.close()
+        self._connection = None
+        self._leaving.close()
 
     def __exit__(self, *_: object) -> None:
         self.close()
@@ -95,7 +95,7 @@ class PolicyClient(AbstractContextManager["PolicyClient"]):
     def _connected(self) -> ClientConnection:
         headers = {"Authorization": f"Api-Key {self._token}"} if self._token else None
         try:
-            return connect(
+            connecting = connect(
                 self._url,
                 additional_headers=headers,
                 compression=None,
@@ -103,6 +103,7 @@ class PolicyClient(AbstractContextManager["PolicyClient"]):
                 max_size=wire.MAX_BYTES,
                 proxy=None,
             )
+            return self._leaving.enter_context(connecting)
         except InvalidStatus as error:
             body = (error.response.body or b"").decode(errors="replace").strip()
             raise ServerError(f"{self._url}: {error}: {body:.300}") from None

@@ -1,9 +1,7 @@
 """Each example runs, and is as short as it says."""
 
 import runpy
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -22,9 +20,7 @@ def test_an_example_is_short(example: Path) -> None:
 
 
 def test_the_simulated_arm_runs_over_the_wire_and_refuses_a_policy_for_another_robot(
-    served_policy: Callable[..., Any],
-    serving: Callable[..., Any],
-    capsys: pytest.CaptureFixture[str],
+    served_policy, serving, capsys
 ) -> None:
     served = served_policy()
     phantom = {"state": STATE, "sensor": SENSOR}

@@ -210,9 +210,7 @@ def test_demonstrations_keep_to_the_example() -> None:
         ("speed: {most: {gripper: 1}}", "gripper says where to be, and the state has no channel"),
     ],
 )
-def test_what_a_file_gets_wrong_is_told_by_file_and_key(
-    tmp_path: Path, text: str, said: str
-) -> None:
+def test_what_a_file_gets_wrong_is_told_by_file_and_key(tmp_path, text: str, said: str) -> None:
     path = tmp_path / "limits.yaml"
     path.write_text(text)
     with pytest.raises(ConfigError, match=re.escape(said)) as error:

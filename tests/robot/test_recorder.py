@@ -24,7 +24,7 @@ from pipeline.simulation.environment import InsertionEnvironment
 from pipeline.simulation.insertion_formats import INSTRUCTION
 from pipeline.simulation.rendering import VIEWS
 from pipeline.store import FeatureStore
-from pipeline.vlm.feature_spec import FeatureSpec, feature_spec
+from pipeline.vlm.feature_spec import feature_spec
 from pipeline.vlm.preparation import Preparer
 
 REUSE = 3
@@ -60,14 +60,9 @@ def drive(
     folder: Path,
     metadata: Mapping[str, Any],
     key_of: Callable[[Frames], bytes],
-    *,
-    late: int = 0,
     ticks: int | None = None,
 ) -> Driven:
-    """The demonstrator's episode; answers come `late` ticks after their frames, actions with them.
-
-    Every third tick is looked at.
-    """
+    """The demonstrator's episode; every third tick is looked at."""
     environment = InsertionEnvironment("full", cameras=False)
     observed, _ = environment.reset(seed=11)
     driven = Driven(RunRecorder(folder, metadata, INSTRUCTION, {"execute": 1}))
@@ -76,19 +71,16 @@ def drive(
         if tick % REUSE == 0:
             frames = environment.frames()
             recorder.frames(frames)
-            driven.looked.append((tick, frames, key_of(frames)))
-        for looked_at, _, key in driven.looked:
-            if looked_at + late == tick:
-                said = {"feature_key": np.frombuffer(key, np.uint8), "feature_age_s": 0.05 + late}
-                recorder.answer(said)
-        action = environment.insertion.expert_action() if tick >= late else None
+            driven.looked.append((tick, frames, key := key_of(frames)))
+            said = {"feature_key": np.frombuffer(key, np.uint8), "feature_age_s": 0.05}
+            recorder.answer(said)
+        action = environment.insertion.expert_action()
         recorder.tick(observed, action)
         for name in ("state", "state_time", "sensor", "sensor_time"):
             driven.readings.setdefault(name, []).append(observed[name])
-        if action is not None:
-            driven.sent.append(action.astype(np.float32))
-            driven.time.append(float(observed["time"][0]))
-        observed = environment.step(np.zeros(7) if action is None else action)[0]
+        driven.sent.append(action.astype(np.float32))
+        driven.time.append(float(observed["time"][0]))
+        observed = environment.step(action)[0]
         tick += 1
     return driven
 
@@ -112,22 +104,14 @@ def shades(camera: Any) -> list[int]:
 
 
 @pytest.fixture(scope="module")
-def vlm(demo_checkpoint: Path) -> dict[str, Any]:
+def run(demo_checkpoint: Path, tmp_path_factory: pytest.TempPathFactory):
+    """A whole run, its recording, and the store that is extracted from it."""
+    folder = tmp_path_factory.mktemp("run")
     size = {"image_resize_height": 56, "image_resize_width": 56}
-    return {"checkpoint": str(demo_checkpoint), "dtype": "float32", "pooling": ["mean"], **size}
-
-
-def params_of(vlm: Mapping[str, Any], folder: Path) -> Params:
-    sources = [{"name": "runs", "path": "runs"}]
-    data = {"root": str(folder), "sources": sources, "vlm_reuse_count": REUSE}
-    document = {"data": data, "vlm": vlm, "extract": {"store": str(folder / "runs.zarr")}}
-    return Params.model_validate(document)
-
-
-@pytest.fixture(scope="module")
-def live(vlm: dict[str, Any], tmp_path_factory: pytest.TempPathFactory):
-    """The spec of the features, and what a robot's key of frames is."""
-    params = params_of(vlm, tmp_path_factory.mktemp("live"))
+    vlm = {"checkpoint": str(demo_checkpoint), "dtype": "float32", "pooling": ["mean"], **size}
+    data = {"root": str(folder), "sources": [{"name": "runs", "path": "runs"}]}
+    document = {"data": data | {"vlm_reuse_count": REUSE}, "vlm": vlm}
+    params = Params.model_validate(document | {"extract": {"store": str(folder / "runs.zarr")}})
     spec = feature_spec(params.vlm, "float32", VIEWS, file_digest)
     preparer = Preparer(params.vlm, spec)
 
@@ -135,21 +119,10 @@ def live(vlm: dict[str, Any], tmp_path_factory: pytest.TempPathFactory):
         seen = {view: image for view, (_, image) in frames.items()}
         return spec.row_key(preparer.render(INSTRUCTION, list(seen)), seen)
 
-    return spec, key_of
-
-
-def told(spec: FeatureSpec) -> dict[str, Any]:
-    return metadata_of() | {"feature_spec": spec.attrs(), "feature_spec_digest": spec.digest}
-
-
-@pytest.fixture(scope="module")
-def run(vlm: dict[str, Any], live, tmp_path_factory: pytest.TempPathFactory):
-    """A whole run, its recording, and the store that is extracted from it."""
-    spec, key_of = live
-    folder = tmp_path_factory.mktemp("run")
-    driven = drive(folder / "runs", told(spec), key_of)
+    told = {"feature_spec": spec.attrs(), "feature_spec_digest": spec.digest}
+    driven = drive(folder / "runs", metadata_of() | told, key_of)
     path = driven.recorder.finish("inserted", {"tick_ms": {"p50": 1.5}})
-    extract(params_of(vlm, folder), say=lambda _: None)
+    extract(params, say=lambda _: None)
     return driven, path, FeatureStore.open(folder / "runs.zarr")
 
 
@@ -199,18 +172,6 @@ def test_a_store_of_a_run_has_its_actions_its_clocks_and_the_robots_keys(run) ->
     assert compare_keys(path, store) == same
 
 
-def test_late_answers_leave_out_the_ticks_before_the_first_action(live, vlm, tmp_path) -> None:
-    spec, key_of = live
-    driven = drive(tmp_path / "runs", told(spec), key_of, late=2, ticks=12)
-    path = driven.recorder.finish("done")
-    extract(params_of(vlm, tmp_path), say=lambda _: None)
-    store = FeatureStore.open(tmp_path / "runs.zarr")
-    assert store.ticks == len(driven.sent) == 10
-    np.testing.assert_array_equal(store.array("tick/action"), np.stack(driven.sent))
-    assert "; " not in compare_keys(path, store)
-    assert len(store.array("state/time")) == 120
-
-
 def observed_at(tick: int, **readings: Any) -> dict[str, Any]:
     return {"time": np.array([5 + tick / 10]), **readings}
 
@@ -226,7 +187,7 @@ def image_of(shade: int) -> np.ndarray:
 NONE: dict[str, Any] = {"names": [], "units": []}
 
 
-def test_streams_that_the_policy_lacks_are_not_recorded(tmp_path: Path) -> None:
+def test_streams_that_the_policy_lacks_are_not_recorded(tmp_path) -> None:
     path = drive(tmp_path, metadata_of(sensor=NONE), no_key, ticks=5).recorder.finish("done")
     recording = opened(path)
     assert recording.sensor() is None and recording.state() is not None
@@ -239,22 +200,21 @@ def test_streams_that_the_policy_lacks_are_not_recorded(tmp_path: Path) -> None:
     assert recording.state() is None and not recording.cameras()
 
 
-def test_rows_begin_when_all_streams_have_and_a_view_that_never_came_is_missing(
-    tmp_path: Path,
-) -> None:
+def test_rows_begin_when_all_streams_have_and_a_view_that_never_came_is_missing(tmp_path) -> None:
     recorder = RunRecorder(tmp_path, metadata_of(), "Push")
     for tick in range(6):
         if tick == 3:
             recorder.frames({"View1": (5.3, image_of(7)), "Side": (5.3, image_of(9))})
-        recorder.tick(observed_at(tick, **(state_at(tick) if tick else {})), np.full(7, tick))
+        action = None if tick in (0, 4) else np.full(7, tick)  # no chunk yet, or one was missing
+        recorder.tick(observed_at(tick, **(state_at(tick) if tick else {})), action)
     path = recorder.finish("done")
     recording = opened(path)
     action = recording.action()
-    assert action is not None and action.values[:, 0].tolist() == [3, 4, 5]
+    assert action is not None and action.values[:, 0].tolist() == [3, 5]
     assert end_of(path)["start_s"] == 5.3 and list(recording.cameras()) == ["View1"]
 
 
-def test_a_frame_is_no_newer_than_the_tick_that_it_came_with(tmp_path: Path) -> None:
+def test_a_frame_is_no_newer_than_the_tick_that_it_came_with(tmp_path) -> None:
     recorder = RunRecorder(tmp_path, metadata_of(), "Push")
     for tick in range(4):
         if tick % 2 == 0:
@@ -266,7 +226,7 @@ def test_a_frame_is_no_newer_than_the_tick_that_it_came_with(tmp_path: Path) -> 
     assert shades(camera) == [0, 2]
 
 
-def test_equal_images_are_stored_once(tmp_path: Path) -> None:
+def test_equal_images_are_stored_once(tmp_path) -> None:
     sizes: list[int] = []
     noise = np.random.default_rng(0).integers(0, 256, (80, 100, 3), np.uint8)
     for looks, images in ((range(20), 1), (range(0, 20, 3), 4), (range(20), 20)):
@@ -280,7 +240,7 @@ def test_equal_images_are_stored_once(tmp_path: Path) -> None:
     np.testing.assert_allclose(np.array(sizes) / noise.nbytes, [1, 4, 20], rtol=0.15)
 
 
-def test_readings_that_are_no_numbers_are_left_out_and_counted(tmp_path: Path) -> None:
+def test_readings_that_are_no_numbers_are_left_out_and_counted(tmp_path) -> None:
     recorder = RunRecorder(tmp_path, metadata_of(), "Push")
     state = np.arange(48, dtype=np.float32).reshape(4, 12)
     state[1, 3], state[2, 0] = np.nan, np.inf
@@ -296,7 +256,7 @@ def test_readings_that_are_no_numbers_are_left_out_and_counted(tmp_path: Path) -
     assert end_of(path)["readings_left_out"] == {"state": 4}
 
 
-def test_images_that_find_no_room_are_dropped_and_counted(tmp_path: Path, monkeypatch) -> None:
+def test_images_that_find_no_room_are_dropped_and_counted(tmp_path, monkeypatch) -> None:
     monkeypatch.setattr(recorder_module, "MOST_IMAGE_BYTES", 2 * image_of(0).nbytes + 1)
     go = threading.Event()
 
@@ -319,7 +279,7 @@ def test_images_that_find_no_room_are_dropped_and_counted(tmp_path: Path, monkey
 
 
 def test_a_disk_that_does_not_keep_up_fails_the_recording_not_the_run(
-    tmp_path: Path, monkeypatch
+    tmp_path, monkeypatch
 ) -> None:
     monkeypatch.setattr(recorder_module, "MOST_BYTES", 100)
     recorder = RunRecorder(tmp_path, metadata_of(), "Push")
@@ -331,7 +291,7 @@ def test_a_disk_that_does_not_keep_up_fails_the_recording_not_the_run(
         recorder.finish("done")
 
 
-def test_what_the_loop_gives_wrongly_fails_the_recording_not_the_run(tmp_path: Path) -> None:
+def test_what_the_loop_gives_wrongly_fails_the_recording_not_the_run(tmp_path) -> None:
     recorder = RunRecorder(tmp_path, metadata_of(), "Push")
     recorder.tick(observed_at(0), np.zeros(7))
     recorder.tick(observed_at(1), np.zeros(3))
@@ -344,7 +304,7 @@ def test_what_the_loop_gives_wrongly_fails_the_recording_not_the_run(tmp_path: P
     assert recover(recorder.part).name == "run_000000"
 
 
-def test_a_recording_is_one_episode(tmp_path: Path) -> None:
+def test_a_recording_is_one_episode(tmp_path) -> None:
     recorder = RunRecorder(tmp_path, metadata_of(), "Push")
     for tick in range(4):
         recorder.tick(observed_at(tick % 3, reset=tick % 3 == 0), np.full(7, tick))
@@ -355,7 +315,7 @@ def test_a_recording_is_one_episode(tmp_path: Path) -> None:
     assert action is not None and action.values[:, 0].tolist() == [0, 1, 2]
 
 
-def test_a_run_that_stops_before_its_first_action_is_recorded(tmp_path: Path) -> None:
+def test_a_run_that_stops_before_its_first_action_is_recorded(tmp_path) -> None:
     recorder = RunRecorder(tmp_path, metadata_of(), "Push")
     for tick in range(4):
         if tick == 1:
@@ -372,9 +332,7 @@ def test_a_run_that_stops_before_its_first_action_is_recorded(tmp_path: Path) ->
         recording.action()
 
 
-def test_one_observation_that_a_kill_leaves_is_recovered(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_one_observation_that_a_kill_leaves_is_recovered(tmp_path, monkeypatch) -> None:
     def kill(part: Path, end: Mapping[str, Any]) -> Path:
         raise KeyboardInterrupt
 
@@ -391,7 +349,7 @@ def test_one_observation_that_a_kill_leaves_is_recovered(
 
 
 def test_a_run_without_an_observation_is_no_recording_and_a_finished_one_not_recovered(
-    tmp_path: Path,
+    tmp_path,
 ) -> None:
     recorder = RunRecorder(tmp_path, metadata_of(), "Push")
     with pytest.raises(RecordingError, match="the robot was never observed"):
@@ -409,7 +367,7 @@ def test_a_run_without_an_observation_is_no_recording_and_a_finished_one_not_rec
 
 
 @pytest.mark.parametrize("shape", [(1, 1, 3), (37, 51, 3)])
-def test_a_png_has_the_very_pixels(tmp_path: Path, shape: tuple[int, ...]) -> None:
+def test_a_png_has_the_very_pixels(tmp_path, shape: tuple[int, ...]) -> None:
     image = np.random.default_rng(0).integers(0, 256, shape, np.uint8)
     file = tmp_path / "frame.png"
     file.write_bytes(encode_png(image))
@@ -418,7 +376,7 @@ def test_a_png_has_the_very_pixels(tmp_path: Path, shape: tuple[int, ...]) -> No
         np.testing.assert_array_equal(np.asarray(read), image)
 
 
-def test_a_folder_that_cannot_be_made_is_named(tmp_path: Path) -> None:
+def test_a_folder_that_cannot_be_made_is_named(tmp_path) -> None:
     (tmp_path / "file").write_text("no folder")
     with pytest.raises(
         RecordingError, match=r"file/runs: runs cannot be recorded there: Not a dir"

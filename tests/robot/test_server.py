@@ -6,7 +6,6 @@ import socket
 import threading
 from collections.abc import Callable, Generator
 from contextlib import contextmanager
-from pathlib import Path
 from typing import Any
 
 import msgpack
@@ -72,7 +71,7 @@ def closing_code(bare: ClientConnection) -> int:
 
 
 def test_a_connection_is_one_memory_and_bit_for_bit_what_a_session_in_process_is(
-    served_policy: Served, serving: Serving, observe: Observe
+    served_policy, serving, observe
 ) -> None:
     served = served_policy("flow_matching")
     server, here = serving(served, seed=3), served.session(seed=3)
@@ -93,7 +92,7 @@ def test_a_connection_is_one_memory_and_bit_for_bit_what_a_session_in_process_is
 
 
 def test_observations_of_one_connection_are_answered_in_order(
-    served_policy: Served, serving: Serving, observe: Observe
+    served_policy, serving, observe
 ) -> None:
     with opened(serving(served_policy())) as bare:
         messages = [wire.pack(observe(tick)) for tick in range(7)]
@@ -105,7 +104,7 @@ def test_observations_of_one_connection_are_answered_in_order(
 
 
 def test_while_the_model_looks_healthz_answers_and_too_many_are_told_busy(
-    served_policy: Served, serving: Serving, observe: Observe
+    served_policy, serving, observe
 ) -> None:
     """The connection stays, and has taken the readings and the reset."""
     served = served_policy()
@@ -146,7 +145,7 @@ def array_of(dtype: str, shape: Any, data: bytes) -> dict[bytes, Any]:
     ],
 )
 def test_what_is_wrong_with_a_message_costs_its_connection_only(
-    served_policy: Served, serving: Serving, observe: Observe, message: Any, said: str, code: int
+    served_policy, serving, observe, message: Any, said: str, code: int
 ) -> None:
     server = serving(served_policy())
     with client_of(server) as good:
@@ -161,7 +160,7 @@ def test_what_is_wrong_with_a_message_costs_its_connection_only(
 
 
 def test_each_event_is_a_line_and_status_says_what_happened(
-    served_policy: Served, serving: Serving, observe: Observe
+    served_policy, serving, observe
 ) -> None:
     server: Any = serving(served_policy(), log="json")
     assert json.loads(get(server, "/status.json")[1])["latency"] == {}
@@ -196,7 +195,7 @@ def test_each_event_is_a_line_and_status_says_what_happened(
     assert sum(line["event"] == "refused" for line in lines) == 1, "the others are the same"
 
 
-def test_what_repeats_is_counted(served_policy: Served, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_repeats_is_counted(served_policy, monkeypatch) -> None:
     now_s, lines = [0.0], list[str]()
     monkeypatch.setattr("pipeline.robot.server_status.monotonic", lambda: now_s[0])
     status = ServerStatus(served_policy().metadata, lines.append)
@@ -216,9 +215,7 @@ def test_what_repeats_is_counted(served_policy: Served, monkeypatch: pytest.Monk
     assert len(status._written) <= 1000 and len(json.loads(status.json())["refusals"]) == 20
 
 
-def test_a_client_of_a_known_robot_is_answered(
-    served_policy: Served, serving: Serving, observe: Observe
-) -> None:
+def test_a_client_of_a_known_robot_is_answered(served_policy, serving, observe) -> None:
     served = served_policy()
     own = observe(0, state=np.arange(12.0), state_time=None, sensor=None, sensor_time=None)
     cameras = ("cam_high", "cam_left_wrist", "cam_right_wrist")
@@ -230,9 +227,7 @@ def test_a_client_of_a_known_robot_is_answered(
     np.testing.assert_array_equal(answer["actions"], served.session().infer(own)["actions"])
 
 
-def test_a_message_beyond_the_bound_is_not_read(
-    served_policy: Served, serving: Serving, observe: Observe
-) -> None:
+def test_a_message_beyond_the_bound_is_not_read(served_policy, serving, observe) -> None:
     server = serving(served_policy(), max_message_mb=1)
     with opened(server) as bare:
         bare.send(b"\0" * (2**20 + 1))
@@ -242,7 +237,7 @@ def test_a_message_beyond_the_bound_is_not_read(
 
 
 def test_a_bug_is_said_in_one_line_and_told_in_full_here(
-    served_policy: Served, serving: Serving, observe: Observe, capfd: Any
+    served_policy, serving, observe, capfd
 ) -> None:
     served = served_policy()
 
@@ -257,12 +252,12 @@ def test_a_bug_is_said_in_one_line_and_told_in_full_here(
     assert "secret of the house" in capfd.readouterr().err
 
 
-def test_who_says_nothing_is_left(served_policy: Served, serving: Serving) -> None:
+def test_who_says_nothing_is_left(served_policy, serving) -> None:
     with opened(serving(served_policy(), idle_s=0.2)) as bare:
         assert closing_code(bare) == 1008
 
 
-def test_the_token_is_asked_for(served_policy: Served, serving: Serving, observe: Observe) -> None:
+def test_the_token_is_asked_for(served_policy, serving, observe) -> None:
     server = serving(served_policy(), token="s3cret")
     for wrong in (None, "s3cre", "s3cretx", "é"):
         headers = {"Authorization": f"Api-Key {wrong}"} if wrong else {}
@@ -276,7 +271,7 @@ def test_the_token_is_asked_for(served_policy: Served, serving: Serving, observe
     assert get(server, "/status.json", Authorization="Api-Key s3cret")[0] == 200
 
 
-def test_pages_of_other_places_are_refused(served_policy: Served, serving: Serving) -> None:
+def test_pages_of_other_places_are_refused(served_policy, serving) -> None:
     server = serving(served_policy())
     for headers in (
         {"Origin": "https://example.org"},
@@ -303,7 +298,7 @@ def test_pages_of_other_places_are_refused(served_policy: Served, serving: Servi
     ],
 )
 def test_a_request_that_no_server_can_read_is_refused_with_a_reason(
-    served_policy: Served, serving: Serving, path: str, headers: list[str], said: str, capfd: Any
+    served_policy, serving, path: str, headers: list[str], said: str, capfd
 ) -> None:
     server = serving(served_policy(), token="s3cret")
     host, _, port = server.address.rpartition(":")
@@ -315,7 +310,7 @@ def test_a_request_that_no_server_can_read_is_refused_with_a_reason(
 
 
 def test_stopping_answers_what_is_under_way_and_takes_no_more(
-    served_policy: Served, serving: Serving, observe: Observe
+    served_policy, serving, observe
 ) -> None:
     served = served_policy()
     blocked = Blocked(served)
@@ -336,7 +331,7 @@ def params(**changed: Any) -> ServeParams:
     return ServeParams.model_validate(changed)
 
 
-def test_tokens(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_tokens(tmp_path, monkeypatch) -> None:
     monkeypatch.delenv("VLA_SERVE_TOKEN", raising=False)
     file = tmp_path / "token.txt"
     file.write_text(" abc\n")
@@ -369,7 +364,7 @@ def test_an_address_that_is_taken_or_somebody_elses_is_refused() -> None:
 
 
 def test_a_robot_counts_until_its_observation_is_answered_though_it_has_left(
-    served_policy: Served, serving: Serving, observe: Observe
+    served_policy, serving, observe
 ) -> None:
     """Or a stranger who comes and goes would fill the memory with observations that wait."""
     served = served_policy()

@@ -25,10 +25,10 @@ SEED = 78
 BLIND: dict[str, Any] = {f"images/{view}": None for view in VIEWS}
 
 
-def drive(session: Session, chunking: Any) -> list[np.ndarray]:
+def drive(session: Session) -> list[np.ndarray]:
     """The actions of an episode of the phantom that the session drives tick by tick."""
     metadata = session.metadata
-    executor = Executor(chunking, 1, metadata["horizon"], metadata["moving"])
+    executor = Executor("none", 1, metadata["horizon"], metadata["moving"])
     robot = InsertionEnvironment("full", cameras=False)
     robot.reset(seed=SEED)
     readings, sent, reset = robot.readings(), [], {"reset": SEED}
@@ -36,25 +36,17 @@ def drive(session: Session, chunking: Any) -> list[np.ndarray]:
         observation = {**readings, **reset, "prompt": INSTRUCTION}
         for view, (time, frame) in robot.frames().items():
             observation |= {f"images/{view}": frame, f"images_time/{view}": time}
-        if (guide := executor.begin()) is not None:
-            observation |= {"guide/chunk": guide.chunk, "guide/weight": guide.weight}
+        executor.begin()
         executor.plan(session.infer(observation)["actions"])
         sent.append(executor.next_action().astype(np.float64))
         readings, reset = robot.step(sent[-1])[0], {}
     return sent
 
 
-@pytest.mark.parametrize(
-    ("model_type", "chunking"),
-    [("regression", "temporal"), ("flow_matching", "rtc"), ("diffusion", "none")],
-)  # fmt: skip
 def test_a_session_does_bit_for_bit_what_a_rollout_does(
-    model_type: str,
-    chunking: str,
-    phantom_policy: Served,
-    served_policy: Served,
-    monkeypatch: pytest.MonkeyPatch,
+    phantom_policy, served_policy, monkeypatch
 ) -> None:
+    """The other experts and chunkings are those of `test_over_the_wire`."""
     sent: list[np.ndarray] = []
     step = InsertionEnvironment.step
 
@@ -62,21 +54,21 @@ def test_a_session_does_bit_for_bit_what_a_rollout_does(
         sent.append(action.copy())
         return step(robot, action)
 
-    checkpoint, policy, glance = phantom_policy(model_type)
+    checkpoint, policy, glance = phantom_policy("diffusion")
     with monkeypatch.context() as patch:
         patch.setattr(InsertionEnvironment, "step", watched)
-        wanted = {"episodes": 1, "seed": SEED, "ablations": (), "chunking": chunking}
+        wanted = {"episodes": 1, "seed": SEED, "ablations": ()}
         load: Any = lambda: glance  # noqa: E731
         roll_out(checkpoint, "head", policy, load, RolloutParams.model_validate(wanted))
     assert torch.get_num_threads() == 1
-    served = served_policy(model_type)
-    actions = drive(served.session(), chunking)
+    served = served_policy("diffusion")
+    actions = drive(served.session())
     np.testing.assert_array_equal(actions, sent)
     assert len(actions) > 20
     assert len(served.glance.passes) == len(glance.passes)
 
 
-def test_an_answer_says_what_it_was_made_of(served_policy: Served, observe: Observe) -> None:
+def test_an_answer_says_what_it_was_made_of(served_policy, observe) -> None:
     """The model looks again after three ticks; what is older than in training is warned of once."""
     served = served_policy()
     session = served.session()
@@ -101,9 +93,7 @@ def test_an_answer_says_what_it_was_made_of(served_policy: Served, observe: Obse
     assert "features are 0.40 s old" in warning and "at most 0.30 s" in warning
 
 
-def test_features_of_another_prompt_are_never_answered_with(
-    served_policy: Served, observe: Observe
-) -> None:
+def test_features_of_another_prompt_are_never_answered_with(served_policy, observe) -> None:
     served = served_policy(told=("touch", "leave"))
     session = served.session(fresh=False)
     session.infer(observe(0, prompt="touch"))
@@ -116,7 +106,7 @@ def test_features_of_another_prompt_are_never_answered_with(
     assert left.tobytes() == alone.tobytes() != touched.tobytes()
 
 
-def test_prompts(served_policy: Served, observe: Observe) -> None:
+def test_prompts(served_policy, observe) -> None:
     one = served_policy()
     assert "warnings" not in one.session().infer(observe(0))
     assert one.glance.instructions == [INSTRUCTION]
@@ -134,9 +124,7 @@ def test_prompts(served_policy: Served, observe: Observe) -> None:
     assert "warnings" not in unknown.session().infer(observe(0, prompt="anything"))
 
 
-def test_a_missing_view_is_left_out_as_in_training(
-    served_policy: Served, observe: Observe, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_missing_view_is_left_out_as_in_training(served_policy, observe, monkeypatch) -> None:
     served = served_policy()
     given, policy_observe = [], served.policy.observe
 
@@ -152,7 +140,7 @@ def test_a_missing_view_is_left_out_as_in_training(
 
 
 def test_without_frames_the_first_observation_is_refused_and_leaves_a_session_that_works(
-    served_policy: Served, observe: Observe
+    served_policy, observe
 ) -> None:
     session = served_policy().session()
     with pytest.raises(ObservationError, match="images/View1"):
@@ -161,7 +149,7 @@ def test_without_frames_the_first_observation_is_refused_and_leaves_a_session_th
     assert session.infer(observe(9, **BLIND))["feature_age_s"] == pytest.approx(0.8, abs=1e-6)
 
 
-def test_a_policy_without_features_needs_no_frames(served_policy: Served, observe: Observe) -> None:
+def test_a_policy_without_features_needs_no_frames(served_policy, observe) -> None:
     served = served_policy(features_enabled=False)
     answer = served.session().infer(observe(0, **BLIND))
     assert set(answer) == {"actions", "server_timing"}
@@ -169,9 +157,7 @@ def test_a_policy_without_features_needs_no_frames(served_policy: Served, observ
     assert served.session().infer(observe(0))["actions"].shape == (4, 7)
 
 
-def test_reset_forgets_and_a_seed_draws_the_same_again(
-    served_policy: Served, observe: Observe
-) -> None:
+def test_reset_forgets_and_a_seed_draws_the_same_again(served_policy, observe) -> None:
     session = served_policy("flow_matching").session()
 
     def episode(reset: Any) -> list[np.ndarray]:
@@ -186,7 +172,7 @@ def test_reset_forgets_and_a_seed_draws_the_same_again(
         session.infer(observe(0))
 
 
-def test_sessions_share_a_policy_and_no_memory(served_policy: Served, observe: Observe) -> None:
+def test_sessions_share_a_policy_and_no_memory(served_policy, observe) -> None:
     """Three robots at once get what each gets alone."""
     served = served_policy("flow_matching")
 
@@ -206,9 +192,7 @@ def test_sessions_share_a_policy_and_no_memory(served_policy: Served, observe: O
         np.testing.assert_array_equal(together[robot], alone[robot])
 
 
-def test_what_is_not_fresh_is_answered_while_the_model_looks(
-    served_policy: Served, observe: Observe
-) -> None:
+def test_what_is_not_fresh_is_answered_while_the_model_looks(served_policy, observe) -> None:
     served = served_policy()
     session = served.session(fresh=False)
     session.infer(observe(0))  # the first is waited for
@@ -232,7 +216,7 @@ def test_what_is_not_fresh_is_answered_while_the_model_looks(
     assert session.infer(observe(11))["feature_age_s"] == pytest.approx(0.2, abs=1e-6)
 
 
-def test_a_pass_of_the_episode_before_is_not_taken(served_policy: Served, observe: Observe) -> None:
+def test_a_pass_of_the_episode_before_is_not_taken(served_policy, observe) -> None:
     served = served_policy()
     session = served.session(fresh=False)
     session.infer(observe(0))
@@ -254,9 +238,7 @@ def test_a_pass_of_the_episode_before_is_not_taken(served_policy: Served, observ
     np.testing.assert_array_equal(answer["actions"], alone["actions"])
 
 
-def test_an_answer_that_is_no_number_is_refused(
-    served_policy: Served, observe: Observe, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_answer_that_is_no_number_is_refused(served_policy, observe, monkeypatch) -> None:
     served = served_policy()
     monkeypatch.setattr(served.policy, "act", lambda *_: torch.full((1, 4, 7), torch.nan))
     with pytest.raises(NumericsError, match="not a number"):
@@ -264,7 +246,7 @@ def test_an_answer_that_is_no_number_is_refused(
 
 
 def test_the_first_frames_and_states_of_each_episode_are_looked_at_before_the_model_looks(
-    served_policy: Served, observe: Observe
+    served_policy, observe
 ) -> None:
     class Suspicious:
         """A first look that remembers what it saw, and refuses at last."""
@@ -290,7 +272,7 @@ def test_the_first_frames_and_states_of_each_episode_are_looked_at_before_the_mo
     assert served.glance.passes == []
 
 
-def test_metadata_says_all_that_a_robot_needs(served_policy: Served) -> None:
+def test_metadata_says_all_that_a_robot_needs(served_policy) -> None:
     served = served_policy("flow_matching")
     metadata = served.metadata
     action = served.checkpoint.source["streams"]["action"]
