@@ -24,8 +24,7 @@ from pipeline.policy.normalization import ChannelStatistics, Normalization
 from pipeline.policy.observation import PolicyShape
 from pipeline.policy.policy import Policy
 from pipeline.policy.shape import channel_kinds
-from pipeline.robot.export import Head, export_head, onnx_session
-from pipeline.robot.export_inputs import Inputs, random_inputs
+from pipeline.robot.export import Head, Inputs, export_head, onnx_session, random_inputs
 
 EXPERTS: tuple[ModelType, ...] = ("regression", "diffusion", "flow_matching")
 DIMS = {"demo": 128, "3B": 2048}

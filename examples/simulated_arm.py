@@ -6,8 +6,8 @@ Serve a policy that was trained on the demo first: python -m stages.serve
 import sys
 
 from pipeline.data.insertion import SENSOR, STATE
-from pipeline.robot.chunking import Executor
 from pipeline.robot.client import PolicyClient
+from pipeline.robot.loop import Executor
 from pipeline.simulation.environment import InsertionEnvironment
 from pipeline.simulation.rendering import VIEWS
 

@@ -13,7 +13,7 @@ from pipeline.base.config import RolloutAblation
 from pipeline.base.observation import Observation
 from pipeline.policy import robot_state, shape
 from pipeline.policy.policy import Policy
-from pipeline.robot.robot_memory import RobotMemory
+from pipeline.robot.readings import RobotMemory
 
 AS_IT_IS, ON_TIME = "as it is", "on time"
 NOT_ANCHORED, NEWEST = "not anchored", "newest chunk"
@@ -113,7 +113,7 @@ def _late_state(latency_s: float) -> Any:
 
 
 _sense = RobotMemory.sense
-_SENSE = "pipeline.robot.robot_memory.RobotMemory.sense"
+_SENSE = "pipeline.robot.readings.RobotMemory.sense"
 PATCHES: dict[str, dict[str, Any]] = {
     text.format(late): {_SENSE: _late_state(ms / 1000)}
     for late, ms in LATE.items()

@@ -33,11 +33,10 @@ from pipeline.policy.checkpoint import PolicyCheckpoint
 from pipeline.policy.expert import Generators, Guide
 from pipeline.policy.observation import moving_channels, stream_of
 from pipeline.policy.policy import Policy
-from pipeline.robot.chunking import Executor, check_chunking
 from pipeline.robot.client import PolicyClient
 from pipeline.robot.live_features import LiveFeatures, prove
-from pipeline.robot.loop import ControlLoop, SafeStop
-from pipeline.robot.robot_memory import RobotMemory, SeenFeatures
+from pipeline.robot.loop import ControlLoop, Executor, SafeStop, check_chunking
+from pipeline.robot.readings import RobotMemory, SeenFeatures
 from pipeline.robot.session import stack_guides
 from pipeline.simulation.environment import InsertionEnvironment
 from pipeline.simulation.insertion import INSERTED, TICK_HZ, NeedleInsertion

@@ -10,7 +10,7 @@ from pipeline.base.errors import RecordingError, StoreMismatch
 from pipeline.data.arrays import member, read_npz
 from pipeline.data.lerobot_meta import sidecar
 from pipeline.data.recording import RECORDINGS
-from pipeline.robot.run_recording import RUN, RunDocument
+from pipeline.robot.recorder import RUN, RunDocument
 from pipeline.store import FeatureStore
 
 

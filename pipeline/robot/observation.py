@@ -1,6 +1,7 @@
 """A robot's observations, checked: a mapping from outside becomes a `RobotObservation`.
 
-Each refusal names the field, what was expected, what was found, and what to mend.
+Each refusal names the field, what was expected, what was found, and what to mend. `KEY_MAPS`
+translates the names that openpi's clients of known robots give to what they send.
 """
 
 from collections.abc import Mapping, Sequence
@@ -12,10 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.base.arrays import first_non_finite
-from pipeline.base.errors import ObservationError
+from pipeline.base.errors import ConfigError, ObservationError
 from pipeline.base.source import CLOCK_SLACK_S
-from pipeline.robot.chunking import PlanGuide
-from pipeline.robot.key_maps import KeyMap
+from pipeline.robot.loop import PlanGuide
 
 LONGEST_PROMPT: Final = 1000
 """Characters of an instruction."""
@@ -47,6 +47,73 @@ class RobotObservation:
     def time_s(self) -> float:
         """The time on the robot's clock."""
         return float(self.readings["time"][0])
+
+
+@dataclass(frozen=True)
+class KeyMap:
+    """Names of the images, in the order of the policy's views, and of the parts of the state."""
+
+    images: tuple[str, ...]
+    state: tuple[str, ...]
+
+    def refuse_more(self, views: Sequence[str]) -> None:
+        """Raise `ConfigError` for a policy with more views than there are images."""
+        if len(views) > len(self.images):
+            raise ConfigError(
+                f"serve.transform: expected a policy of at most {len(self.images)} views "
+                f"({', '.join(self.images)}), found {', '.join(views)}"
+            )
+
+    def apply(self, given: Mapping[str, Any], views: Sequence[str]) -> dict[str, Any]:
+        """The fields under the policy's names; what is not known keeps its name.
+
+        An image whose name is that of a view stays that view; the others are the views in order,
+        and those beyond the views are left out. An image may have its channels first. Raises
+        `ObservationError` where a part of the state is missing, or is no number.
+        """
+        fields = {name: value for name, value in given.items() if name not in self.images}
+        own = [f"images/{view}" for view in views]
+        named = not {*own}.isdisjoint(self.images)
+        places = {n: n for n in own} if named else dict(zip(self.images, own, strict=False))
+        for name, place in places.items():
+            if name in given:
+                fields[place] = _channels_last(given[name])
+        parts = [name for name in self.state if name in fields]
+        if parts and len(parts) < len(self.state):
+            missing = ", ".join(name for name in self.state if name not in parts)
+            raise ObservationError(f"{missing}: expected it beside {parts[0]}, found none")
+        if parts:
+            try:
+                joined = np.concatenate([np.atleast_1d(fields.pop(name)) for name in parts], -1)
+            except ValueError as error:
+                raise ObservationError(
+                    f"{' + '.join(parts)}: expected numbers of one reading, found {error}"
+                ) from None
+            fields["state"] = joined
+        return fields
+
+
+KEY_MAPS: Mapping[str, KeyMap] = {
+    "aloha": KeyMap(
+        images=(
+            "images/cam_high", "images/cam_left_wrist", "images/cam_right_wrist", "images/cam_low",
+        ),
+        state=("state",),
+    ),
+    "droid": KeyMap(
+        images=("observation/exterior_image_1_left", "observation/wrist_image_left"),
+        state=("observation/joint_position", "observation/gripper_position"),
+    ),
+    "libero": KeyMap(
+        images=("observation/image", "observation/wrist_image"), state=("observation/state",)
+    ),
+}  # fmt: skip
+"""By the names of `serve.transform`; as openpi's examples of these robots have them."""
+
+
+def _channels_last(image: Any) -> Any:
+    first = isinstance(image, np.ndarray) and image.ndim == 3 and image.shape[0] == 3
+    return np.moveaxis(image, 0, -1) if first and image.shape[-1] != 3 else image
 
 
 class ObservationReader:
@@ -171,40 +238,48 @@ class ObservationReader:
 
 
 class Doubts:
-    """What cannot be true of the observations of an episode, each told once.
-
-    A frame of one value, a state of zeros, and a picture that stays the same to the bit in `_STILL`
-    frames in a row over `_STILL_S` seconds: a camera that runs has noise.
-    """
+    """What is hardly right in an episode of a robot; each doubt is raised once."""
 
     def __init__(self) -> None:
-        self._told = set[str]()
+        self._raised, self._new = set[str](), list[str]()
         self._last = dict[str, tuple[NDArray[np.uint8], int, float]]()
         """Of each view the newest frame, how many in a row were equal to it, and since when."""
 
-    def of(self, observation: RobotObservation) -> list[str]:
-        """The new doubts about an observation, in words."""
-        doubts: dict[str, str] = {}
+    def add(self, name: str, text: str) -> None:
+        """Raise the doubt `name` in these words, unless it was raised before."""
+        if name not in self._raised:
+            self._raised.add(name)
+            self._new.append(text)
+
+    def take(self) -> list[str]:
+        """The doubts that were raised since the last call, in words."""
+        new, self._new = self._new, []
+        return new
+
+    def look(self, observation: RobotObservation) -> None:
+        """Doubt a frame of one value, a state of zeros, and a picture that stands still.
+
+        It stands still if it is the same to the bit in `_STILL` frames in a row over `_STILL_S`
+        seconds: a camera that runs has noise.
+        """
+        now_s = observation.time_s
         for view, frame in observation.frames.items():
-            name, now_s = f"images/{view}", observation.time_s
-            last, times, since_s = self._last.get(view, (None, 0, now_s))
+            name = f"images/{view}"
             if frame.min() == frame.max():
-                doubts[name] = (
-                    f"{name}: every pixel is {frame.min()}: is the camera covered or off?"
-                )
+                text = f"{name}: every pixel is {frame.min()}: is the camera covered or off?"
+                self.add(name, text)
+            last, times, since_s = self._last.get(view, (None, 0, now_s))
             if last is None or not np.array_equal(last, frame):
                 times, since_s = 0, now_s
             self._last[view] = frame, times + 1, since_s
             if times + 1 >= _STILL and now_s - since_s >= _STILL_S:
-                doubts[f"{name} still"] = (
+                still = (
                     f"{name}: the same picture for {now_s - since_s:.1f} s: does the camera run?"
                 )
+                self.add(f"{name} still", still)
         state = observation.readings.get("state")
         if state is not None and not state.any():
-            doubts["state"] = "state: every channel is exactly 0: is it read from the robot?"
-        new = [text for name, text in doubts.items() if name not in self._told]
-        self._told |= doubts.keys()
-        return new
+            self.add("state", "state: every channel is exactly 0: is it read from the robot?")
 
 
 def _flat(given: Mapping[Any, Any]) -> dict[Any, Any]:

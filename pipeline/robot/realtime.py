@@ -27,12 +27,10 @@ from numpy.typing import NDArray
 
 from pipeline.base.config import Chunking
 from pipeline.base.errors import ConfigError, ServerBusy
-from pipeline.robot.chunking import Executor
 from pipeline.robot.limits import Limits
-from pipeline.robot.loop import ControlLoop, SafeStop, StopKind
+from pipeline.robot.loop import ControlLoop, Executor, SafeStop, StopKind
 from pipeline.robot.process import PolicyThread, Watchdog, ended_by_hand, stop_firmly, undisturbed
-from pipeline.robot.readings import PendingReadings, RobotClock
-from pipeline.robot.robot_memory import older_than_trained
+from pipeline.robot.readings import PendingReadings, RobotClock, older_than_trained
 from pipeline.robot.run_report import (
     ANSWER_PARTS,
     MissedTick,

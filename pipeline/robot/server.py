@@ -18,7 +18,6 @@ import traceback
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, suppress
-from functools import partial
 from http import HTTPStatus
 from time import monotonic
 from typing import Final, cast
@@ -35,13 +34,15 @@ from pipeline.base.config import ServeParams
 from pipeline.base.errors import ConfigError, ObservationError, PipelineError, WireError
 from pipeline.robot import wire
 from pipeline.robot.client import TOKEN_VARIABLE
-from pipeline.robot.key_maps import KEY_MAPS
+from pipeline.robot.observation import KEY_MAPS
 from pipeline.robot.run_report import allowed_ms
 from pipeline.robot.server_status import Event, ServerStatus
 from pipeline.robot.session import ServedPolicy, Session
 
 CLOSING_S: Final = 30.0
 """How long an unanswered observation may keep the server from closing."""
+_TURNED_AWAY: Final = (401, 403, 503)
+"""Statuses of requests that are noted as turned away."""
 
 
 def read_token(params: ServeParams) -> str | None:
@@ -171,10 +172,9 @@ class PolicyServer:
 
     async def _converse(self, connection: ServerConnection) -> None:
         """One robot, from its metadata to its last answer."""
-        # Counted until its last observation is answered, which may be after it has left.
-        self.status.connected += 1
         robot, answers, since_s = _address(connection), 0, monotonic()
         try:
+            # Counted until its last observation is answered, which may be after it has left.
             self.status.note("connected", robot)
             await connection.send(wire.pack(self._metadata))
             session = self._served.session(self._params.fresh, self._params.seed, self._key_map)
@@ -185,19 +185,16 @@ class PolicyServer:
                 del message
                 if isinstance(answer, str):
                     event, _, why = answer.partition(": ")
-                    self.status.busy += event == "busy"
                     self.status.note(cast("Event", event), robot, why)
                 answers += isinstance(answer, bytes)
                 await connection.send(answer)
             if code is None:
                 await _leave(connection)
             else:
-                self.status.refused += 1
                 await connection.close(code)
         except (ConnectionClosed, TimeoutError):
             pass  # The robot has left, or sends nothing.
         finally:
-            self.status.connected -= 1
             seconds = monotonic() - since_s
             self.status.note("left", robot, f"{answers} answers in {seconds:.1f} s")
 
@@ -261,54 +258,54 @@ class PolicyServer:
 
     async def _respond(self, connection: ServerConnection, request: Request) -> Response | None:
         """The answer to an HTTP request; None where it opens a websocket."""
-        headers, say = request.headers, partial(_response, connection)
+        headers = request.headers
 
-        def turn_away(status: HTTPStatus, why: str, **headers: str) -> Response:
-            self.status.note("turned away", _address(connection), why)
-            return say(status, f"{why}\n", **headers)
+        def respond(status: HTTPStatus, text: str, **headers: str) -> Response:
+            if status in _TURNED_AWAY:
+                self.status.note("turned away", _address(connection), text)
+            return _response(connection, status, f"{text}\n", **headers)
 
         try:
             path, foreign = urlsplit(request.path).path, self._is_foreign(headers)
             authorized = self._authorized(headers)
             opens = path == "/" and headers.get("Upgrade", "").lower() == "websocket"
         except MultipleValuesError as error:
-            return say(HTTPStatus.BAD_REQUEST, f"expected the header {error} once, found several\n")
+            why = f"expected the header {error} once, found several"
+            return respond(HTTPStatus.BAD_REQUEST, why)
         except ValueError as error:
-            why = f"expected addresses in the path and Host, found another: {error}\n"
-            return say(HTTPStatus.BAD_REQUEST, why)
+            why = f"expected addresses in the path and Host, found another: {error}"
+            return respond(HTTPStatus.BAD_REQUEST, why)
         if path == "/healthz":
-            return say(HTTPStatus.OK, "OK\n")
+            return respond(HTTPStatus.OK, "OK")
+        if "Origin" in headers:
+            return respond(HTTPStatus.FORBIDDEN, "web pages are not served")
         if foreign:
-            why = "web pages are not served"
-            if "Origin" not in headers:
-                why = (
-                    f"expected Host localhost, found {shown(headers.get('Host'))}: by other names "
-                )
-                why += "only a server with a token is asked (serve.token_file)"
-            return turn_away(HTTPStatus.FORBIDDEN, why)
+            why = (
+                f"expected Host localhost, found {shown(headers.get('Host'))}: by other names only "
+                "a server with a token is asked (serve.token_file)"
+            )
+            return respond(HTTPStatus.FORBIDDEN, why)
         if not authorized:
             why = "expected the header Authorization: Api-Key <the server's token>"
-            return turn_away(HTTPStatus.UNAUTHORIZED, why, **{"WWW-Authenticate": "Api-Key"})
+            return respond(HTTPStatus.UNAUTHORIZED, why, **{"WWW-Authenticate": "Api-Key"})
         if path == "/status.json":
             kind = {"Content-Type": "application/json"}
-            return say(HTTPStatus.OK, self.status.json(), **kind)
+            return respond(HTTPStatus.OK, self.status.json(), **kind)
         if not opens:
-            why = "expected a websocket at /, /healthz or /status.json\n"
-            return say(HTTPStatus.NOT_FOUND, why)
-        most = self._params.max_connections
-        if self.status.connected < most:
-            return None
-        why = f"busy: {most} robots are connected (serve.max_connections)"
-        return turn_away(HTTPStatus.SERVICE_UNAVAILABLE, why)
+            why = "expected a websocket at /, /healthz or /status.json"
+            return respond(HTTPStatus.NOT_FOUND, why)
+        if self.status.connected >= (most := self._params.max_connections):
+            why = f"busy: {most} robots are connected (serve.max_connections)"
+            return respond(HTTPStatus.SERVICE_UNAVAILABLE, why)
+        return None
 
     def _is_foreign(self, headers: Headers) -> bool:
-        """Whether the request is from a web page, through a browser on this machine.
+        """Whether a name in `Host` was made to point to this machine, for a web page in a browser.
 
-        Then the browser sends `Origin`, or a `Host` whose name was made to point to this machine.
-        The `Host` is checked only without a token.
+        It is checked only without a token.
         """
         host = urlsplit(f"//{headers.get('Host', '')}").hostname
-        return "Origin" in headers or (self._token is None and not _is_loopback(host or ""))
+        return self._token is None and not _is_loopback(host or "")
 
     def _authorized(self, headers: Headers) -> bool:
         given = headers.get("Authorization", "").encode()

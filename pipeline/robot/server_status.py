@@ -3,7 +3,7 @@
 import json
 import math
 import threading
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from datetime import UTC, datetime
@@ -40,7 +40,7 @@ class ServerStatus:
         say: Callable[[str], None] = lambda line: None,
         form: Literal["text", "json"] = "text",
     ) -> None:
-        self.connected = self.refused = self.busy = 0
+        self._counts: Counter[Event] = Counter()
         shown = ("checkpoint", "step", "model_type", "action_hz", "feature_spec_digest")
         self._policy = {name: metadata[name] for name in shown}
         self._timings, self._since_s = Timings(_TIMED, _TIMINGS), monotonic()
@@ -48,10 +48,13 @@ class ServerStatus:
         self._newest = {
             name: deque[Mapping[str, Any]](maxlen=_SHOWN) for name in ("refusals", "warnings")
         }
-        self._written_s, self._skipped = (
-            dict[tuple[str, ...], float](),
-            dict[tuple[str, ...], int](),
-        )
+        self._written: dict[tuple[str, ...], tuple[float, int]] = {}
+        """When the line of an event was last written, s, and how often it was left out since."""
+
+    @property
+    def connected(self) -> int:
+        """The robots that are connected now."""
+        return self._counts["connected"] - self._counts["left"]
 
     def answered(self, timing: Mapping[str, float]) -> None:
         """Note the `server_timing` of an answer; a part of 0 ms did not happen."""
@@ -59,7 +62,7 @@ class ServerStatus:
             self._timings.note([timing[part] or math.nan for part in _TIMED])
 
     def note(self, event: Event, robot: str, text: str = "") -> None:
-        """Write the line of an event, unless the same one was written within 10 s.
+        """Count an event, and write its line unless the same one was written within 10 s.
 
         `robot` is an address. Events are the same where the host and the text are; slow answers of
         a host are.
@@ -70,15 +73,15 @@ class ServerStatus:
         record: dict[str, Any] = {"time": time, "event": event, "robot": robot, "text": text}
         with self._lock:
             now_s = monotonic()
-            repeats = now_s - self._written_s.get(key, -math.inf) < _QUIET_S
-            if repeats and event not in _EACH:
-                self._skipped[key] = self._skipped.get(key, 0) + 1
+            self._counts[event] += 1
+            written_s, skipped = self._written.get(key, (-math.inf, 0))
+            if now_s - written_s < _QUIET_S and event not in _EACH:
+                self._written[key] = written_s, skipped + 1
                 return
-            if len(self._written_s) >= _REMEMBERED:  # strangers may make up reasons
-                self._written_s.clear()
-                self._skipped.clear()
-            self._written_s[key] = now_s
-            if skipped := self._skipped.pop(key, 0):
+            if len(self._written) >= _REMEMBERED:  # strangers may make up reasons
+                self._written.clear()
+            self._written[key] = now_s, 0
+            if skipped:
                 record["skipped"] = skipped
             if event in _REFUSALS:
                 self._newest["refusals"].append(record)
@@ -92,10 +95,14 @@ class ServerStatus:
     def json(self) -> str:
         """The content of `/status.json`."""
         with self._lock:
-            answered, latency = self._timings.count, self._timings.document()
+            latency = self._timings.document()
             newest = {name: [*events] for name, events in self._newest.items()}
-        counts = {"connected": self.connected, "answered": answered}
-        counts |= {"refused": self.refused, "busy": self.busy}
+            counts = {
+                "connected": self.connected,
+                "answered": self._timings.count,
+                "refused": self._counts["refused"] + self._counts["error"],
+                "busy": self._counts["busy"],
+            }
         seconds = monotonic() - self._since_s
         document = {"policy": self._policy, "seconds": seconds, "counts": counts}
         return json.dumps(document | {"latency": latency} | newest)

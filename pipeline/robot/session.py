@@ -19,12 +19,11 @@ from pipeline.policy.checkpoint import PolicyCheckpoint, find_policy, load_polic
 from pipeline.policy.expert import Guide
 from pipeline.policy.observation import moving_channels
 from pipeline.policy.policy import Policy
-from pipeline.robot.chunking import PlanGuide
 from pipeline.robot.first_look import FirstLook
-from pipeline.robot.key_maps import KeyMap
 from pipeline.robot.live_features import LiveFeatures, prove
-from pipeline.robot.observation import Doubts, ObservationReader, RobotObservation
-from pipeline.robot.robot_memory import RobotMemory, SeenFeatures, older_than_trained
+from pipeline.robot.loop import PlanGuide
+from pipeline.robot.observation import Doubts, KeyMap, ObservationReader, RobotObservation
+from pipeline.robot.readings import RobotMemory, SeenFeatures, older_than_trained
 
 PROTOCOL = 1
 """Version of observations, answers and metadata."""
@@ -49,15 +48,12 @@ class ServedPolicy:
         features: LiveFeatures | None,
         name: str = "",
         look: FirstLook | None = None,
-        say: Callable[[str], None] = print,
     ) -> None:
         """`features` is the proved model, None where the policy looks at no features."""
         self.checkpoint, self.policy, self.look = checkpoint, policy, look
-        self._features, self._say, self._name = features, say, name
+        self._features, self._name = features, name
         self._passes = ThreadPoolExecutor(1, "vlm")
         self._head = threading.Lock()
-        self._told: set[str] = set()
-        self._age_told = False
         self.metadata = self._metadata()
 
     @classmethod
@@ -82,7 +78,7 @@ class ServedPolicy:
         if "features" in policy.encoders:
             features = LiveFeatures(vlm, checkpoint.source["feature_spec"], str(target))
             prove(checkpoint, features, say)
-        return cls(checkpoint, policy, features, str(folder), FirstLook(checkpoint), say)
+        return cls(checkpoint, policy, features, str(folder), FirstLook(checkpoint))
 
     def session(
         self, fresh: bool = True, seed: int = 0, key_map: KeyMap | None = None
@@ -118,34 +114,6 @@ class ServedPolicy:
         if not np.isfinite(chunk).all():
             raise NumericsError("actions: the policy's answer is not a number; stop the robot")
         return chunk, perf_counter() - began
-
-    def instruction(self, prompt: str | None) -> str:
-        """The prompt, or without one the only instruction that the policy was trained on.
-
-        Warns once of an instruction that training never saw. Raises `ObservationError` without a
-        prompt where training saw none or several.
-        """
-        trained = self.checkpoint.instructions
-        known = ", ".join(map(repr, trained))
-        if prompt is None and len(trained) != 1:
-            raise ObservationError(
-                f"prompt: expected what the robot is to do, found none. Trained on: {known}"
-            )
-        prompt = trained[0] if prompt is None else prompt
-        if trained and prompt not in {*trained, *self._told} and len(self._told) < 100:
-            self._told.add(prompt)
-            self._say(f"warning: the policy was never trained on {prompt!r:.200}, but on {known}")
-        return prompt
-
-    def warn_of_age(self, age_s: float) -> None:
-        """Warn once of features that are older than those in training."""
-        if older_than_trained(age_s, self.metadata["trained_age_s"]) and not self._age_told:
-            self._age_told = True
-            self._say(
-                f"warning: features are {age_s:.2f} s old, and the policy was trained on at most "
-                f"{self.metadata['trained_age_s']:.2f} s. rollout.latency_ms simulates what that "
-                "does to it; a faster model helps."
-            )
 
     def _pass(self, waiting: WaitingFrames) -> Pass:
         assert self._features is not None
@@ -206,7 +174,8 @@ class Session:
 
         It also has `server_timing` in ms and, where the policy looks at features, `feature_age_s`,
         `trained_age_s`, the oldest age in training, and `feature_key` (16,). `warnings` lists what
-        cannot be true of the observation, each once an episode. Raises `ObservationError`,
+        is hardly right, each once an episode (`Doubts`; an instruction or an age of features that
+        training never saw). Raises `ObservationError`,
         `NumericsError` and `VLMError`.
         """
         return self.answer(self.take(observation))
@@ -237,9 +206,16 @@ class Session:
             key, age_s = np.frombuffer(seen.key, np.uint8), float(fields["feature_age"])
             trained_s = self.metadata["trained_age_s"]
             answer |= {"feature_age_s": age_s, "trained_age_s": trained_s, "feature_key": key}
-            self._served.warn_of_age(age_s)
-        if doubts := self._doubts.of(observation):
-            answer["warnings"] = doubts
+            if older_than_trained(age_s, trained_s):
+                self._doubts.add(
+                    "age",
+                    f"features are {age_s:.2f} s old, and the policy was trained on at most "
+                    f"{trained_s:.2f} s. rollout.latency_ms simulates what that does to it; a "
+                    "faster model helps.",
+                )
+        self._doubts.look(observation)
+        if warnings := self._doubts.take():
+            answer["warnings"] = warnings
         return answer
 
     def _begin_episode(self) -> None:
@@ -273,9 +249,9 @@ class Session:
         spent = self._collect(wait=new_prompt)
         due = new_prompt or observation.time_s - self._began_s >= self._between_s
         if observation.frames and due:
-            instruction = self._served.instruction(observation.prompt)
-            self._waiting.append((observation, instruction))
-            self._began_s, self._instruction = observation.time_s, instruction
+            self._instruction = self._instructed(observation.prompt)
+            self._waiting.append((observation, self._instruction))
+            self._began_s = observation.time_s
         if self._waiting and self._running is None:
             self._running = self._served.begin_pass(self._waiting)
         spent = self._collect(self._fresh or new_prompt or self._memory.features is None) or spent
@@ -285,6 +261,23 @@ class Session:
                 f"images: expected some of {views} with the first observation of an episode"
             )
         return spent
+
+    def _instructed(self, prompt: str | None) -> str:
+        """The prompt, or without one the only instruction that the policy was trained on.
+
+        Raises `ObservationError` without a prompt where training saw none or several.
+        """
+        trained = self._served.checkpoint.instructions
+        known = ", ".join(map(repr, trained))
+        if prompt is None and len(trained) != 1:
+            raise ObservationError(
+                f"prompt: expected what the robot is to do, found none. Trained on: {known}"
+            )
+        instruction = trained[0] if prompt is None else prompt
+        if trained and instruction not in trained:
+            why = f"prompt: the policy was never trained on {instruction!r:.200}, but on {known}"
+            self._doubts.add("prompt", why)
+        return instruction
 
     def _collect(self, wait: bool) -> float:
         """Take the features of a pass that has ended; the seconds it took, 0 without one."""

@@ -6,8 +6,7 @@ layout.py               the hidden parameters of an episode
 insertion.py            the physics, one step for each control tick
 expert.py               the demonstrator
 rendering.py            three camera views
-environment.py          the insertion as a gymnasium environment
-realtime.py             the environment at the pace of a clock, as a robot
+environment.py          the insertion as a gymnasium environment, and as a robot in real time
 recorder.py             an episode recorded by clocks that start late and jitter
 insertion_formats.py    writers of an episode in each format
 demo_recordings.py      the demo's sets of recordings

@@ -155,7 +155,7 @@ def simulated_time(monkeypatch: pytest.MonkeyPatch) -> SimulatedTime:
 
 @pytest.fixture
 def served_policy() -> Any:
-    """`served_policy(model_type, ...)`: the same, served; it has `glance` and `said`."""
+    """`served_policy(model_type, ...)`: the same, served; it has `glance`."""
     all_served: list[ServedPolicy] = []
 
     def build(
@@ -164,10 +164,9 @@ def served_policy() -> Any:
         checkpoint, policy, glance = build_policy(model_type, **changed)
         if told is not None:
             checkpoint = replace(checkpoint, instructions=tuple(told))
-        said: list[str] = []
         features: Any = glance if "features" in policy.encoders else None
-        served: Any = ServedPolicy(checkpoint, policy, features, "models/head", look, said.append)
-        served.glance, served.said = glance, said
+        served: Any = ServedPolicy(checkpoint, policy, features, "models/head", look)
+        served.glance = glance
         all_served.append(served)
         return served
 
@@ -201,14 +200,15 @@ def observe() -> Callable[..., dict[str, Any]]:
 
 @pytest.fixture
 def serving() -> Any:
-    """`serving(served, token=None, key=value, ...)`: a server of it in a thread, which ends
-    with the test; the keys are those of the section `serve`."""
+    """`serving(served, token=None, key=value, ...)`: a server of it in a thread, which ends with
+    the test; the keys are those of the section `serve`. It has the `lines` that it wrote."""
     running: list[tuple[PolicyServer, threading.Thread, socket.socket]] = []
 
     def start(served: Any, token: str | None = None, **changed: Any) -> PolicyServer:
         params = ServeParams.model_validate({"port": 0} | changed)
         bound = listen(params)
-        server = PolicyServer(served, params, token, bound, served.said.append)
+        server: Any = PolicyServer(served, params, token, bound, (lines := list[str]()).append)
+        server.lines = lines
         up = threading.Event()
         thread = threading.Thread(target=server.run, args=(up.set,))
         thread.start()

@@ -28,14 +28,17 @@ class Refuse:
         if name.partition(".")[0] not in allowed:
             raise ImportError(f"{name} is not on the robot's computer")
 
-sys.meta_path.insert(0, Refuse())
-from pipeline.robot.chunking import Executor
+sys.meta_path.insert(0, refuse := Refuse())
 from pipeline.robot.client import PolicyClient
+from pipeline.robot.loop import Executor
 print(sorted({name.partition(".")[0] for name in sys.modules} & {"numpy", "msgpack", "websockets"}))
+sys.meta_path.remove(refuse)
+import pipeline.robot.lerobot_arm, pipeline.robot.realtime, pipeline.robot.recorder
+print("torch" in sys.modules)
 """
 
 
-def test_it_needs_numpy_msgpack_and_websockets_alone() -> None:
+def test_it_needs_numpy_msgpack_and_websockets_alone_and_running_a_robot_no_torch() -> None:
     """And so does the executor, which plays what it gets."""
     done = subprocess.run(
         [sys.executable, "-W", "error", "-c", LIGHT],
@@ -45,12 +48,10 @@ def test_it_needs_numpy_msgpack_and_websockets_alone() -> None:
         env=os.environ | {"PYTHONPATH": str(ROOT)},
     )
     assert done.returncode == 0, done.stderr
-    assert done.stdout == "['msgpack', 'numpy', 'websockets']\n"
+    assert done.stdout == "['msgpack', 'numpy', 'websockets']\nFalse\n"
 
 
-def test_a_reset_goes_with_the_next_observation(
-    served_policy: Callable[..., Any], serving: Callable[..., Any], observe: Observe
-) -> None:
+def test_a_reset_goes_with_the_next_observation(served_policy, serving, observe) -> None:
     with PolicyClient(f"ws://{serving(served_policy('flow_matching')).address}") as client:
         client.reset(5)
         first = [client.infer(observe(tick))["actions"] for tick in (0, 1)]
@@ -62,9 +63,9 @@ def test_a_reset_goes_with_the_next_observation(
 
 
 def test_a_refused_observation_says_why_and_the_client_can_begin_again(
-    served_policy: Callable[..., Any], serving: Callable[..., Any], observe: Observe
+    served_policy, serving, observe
 ) -> None:
-    with PolicyClient(f"ws://{serving(served_policy()).address}") as client:
+    with PolicyClient(serving(served_policy()).address) as client:
         with pytest.raises(ObservationError, match=r"^sensors: expected one of.* sensor"):
             client.infer(observe(0, sensors=np.zeros(3)))
         with pytest.raises(ServerError, match="not connected; call reconnect"):
@@ -73,34 +74,19 @@ def test_a_refused_observation_says_why_and_the_client_can_begin_again(
         assert client.infer(observe(0))["actions"].shape == (4, 7)
 
 
-def test_nobody_listens() -> None:
-    with socket.create_server(("127.0.0.1", 0)) as taken:
-        port = taken.getsockname()[1]
+def test_nobody_listens_or_something_else_does() -> None:
+    """What takes the connection and says nothing, among it."""
+    with socket.create_server(("127.0.0.1", 0)) as silent:
+        port = silent.getsockname()[1]
+        with pytest.raises(ServerError, match=r"nobody serves a policy there .timed out"):
+            PolicyClient(f"ws://127.0.0.1:{port}", timeout_s=0.1)
     with pytest.raises(ServerError, match=r"nobody serves a policy there.*Start python -m stages"):
-        PolicyClient(f"ws://127.0.0.1:{port}")
-    with pytest.raises(ServerError, match="nobody serves a policy there"):
-        PolicyClient("ws://no.such.invalid:1")
+        PolicyClient(f"127.0.0.1:{port}")
+    with pytest.raises(ServerError, match="expected an address such as ws://"):
+        PolicyClient("http://127.0.0.1:1")
 
 
-def test_an_address_without_a_scheme_is_a_websockets(
-    served_policy: Callable[..., Any], serving: Callable[..., Any]
-) -> None:
-    with PolicyClient(serving(served_policy()).address) as client:
-        assert client.metadata["protocol"] == 1
-
-
-def test_something_else_listens() -> None:
-    """It takes the connection and says nothing."""
-    with (
-        socket.create_server(("127.0.0.1", 0)) as silent,
-        pytest.raises(ServerError, match=r"nobody serves a policy there .timed out"),
-    ):
-        PolicyClient(f"ws://127.0.0.1:{silent.getsockname()[1]}", timeout_s=0.2)
-
-
-def test_a_late_answer_is_never_taken_for_the_next(
-    served_policy: Callable[..., Any], serving: Callable[..., Any], observe: Observe
-) -> None:
+def test_a_late_answer_is_never_taken_for_the_next(served_policy, serving, observe) -> None:
     served = served_policy()
     go = threading.Event()
     served.glance.before = lambda: go.wait(60)
@@ -114,9 +100,7 @@ def test_a_late_answer_is_never_taken_for_the_next(
         assert client.infer(observe(7))["feature_age_s"] == pytest.approx(0, abs=1e-6)
 
 
-def test_a_lost_connection_says_that_the_memory_is_gone(
-    served_policy: Callable[..., Any], serving: Callable[..., Any], observe: Observe
-) -> None:
+def test_a_lost_connection_says_that_the_memory_is_gone(served_policy, serving, observe) -> None:
     server = serving(served_policy())
     with PolicyClient(f"ws://{server.address}") as client:
         client.infer(observe(0))
@@ -140,13 +124,9 @@ METADATA = {
 @pytest.mark.parametrize(
     ("robot", "said"),
     [
-        (
-            {"state": ["b", "a", "c"]},
-            'state: ["a", "b", "c"] in training, the robot\'s ["b", "a", ',
-        ),
+        ({"state": ["b", "a", "c"]}, 'state: ["a", "b", "c"] in training, the robot\'s ["b"'),
         ({"state_units": ["deg", "rad", "mm"]}, 'state_units: ["deg", "deg", "mm"] in training'),
         ({"action_kind": "absolute"}, 'action_kind: "delta" in training, the robot\'s "absolute"'),
-        ({"sensor": ["s"]}, 'sensor: [] in training, the robot\'s ["s"]'),
         ({"views": ["View2"]}, 'views: ["View1", "View2"] in training, the robot\'s ["View2"]'),
         ({"action_hz": 30}, "action_hz: 10.0 in training, the robot's 30"),
         ({"camera": ["View1"]}, "the robot's description: expected views, "),
@@ -158,25 +138,13 @@ def test_another_robot_is_refused_with_both_sides_named(robot: dict[str, Any], s
 
 
 def test_the_policys_own_robot_is_not_refused() -> None:
+    """It may have more views, in another order."""
     refuse_other_robot({}, METADATA)
-    refuse_other_robot(
-        {
-            "state": ("a", "b", "c"),
-            "state_units": ["deg", "deg", "mm"],
-            "sensor": [],
-            "action": ["dx", "dy"],
-            "action_units": ["mm", "mm"],
-            "action_kind": "delta",
-            "views": ["View2", "View1", "View7"],
-            "action_hz": 10,
-        },
-        METADATA,
-    )
+    own = {"state": ("a", "b", "c"), "sensor": [], "action_kind": "delta", "action_hz": 10}
+    refuse_other_robot(own | {"views": ["View2", "View1", "View7"]}, METADATA)
 
 
-def test_another_robot_is_refused_before_it_says_anything(
-    served_policy: Callable[..., Any], serving: Callable[..., Any]
-) -> None:
+def test_another_robot_is_refused_before_it_says_anything(served_policy, serving) -> None:
     server = serving(served_policy())
     with pytest.raises(CheckpointMismatch, match="action_hz"):
         PolicyClient(f"ws://{server.address}", robot={"action_hz": 30.0})

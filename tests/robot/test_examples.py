@@ -1,9 +1,7 @@
 """Each example runs, and is as short as it says."""
 
 import runpy
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -21,10 +19,8 @@ def test_an_example_is_short(example: Path) -> None:
     assert len(example.read_text(encoding="utf-8").splitlines()) <= MOST_LINES
 
 
-def test_the_simulated_arm_runs_over_the_wire(
-    served_policy: Callable[..., Any],
-    serving: Callable[..., Any],
-    capsys: pytest.CaptureFixture[str],
+def test_the_simulated_arm_runs_over_the_wire_and_refuses_a_policy_for_another_robot(
+    served_policy, serving, capsys
 ) -> None:
     served = served_policy()
     phantom = {"state": STATE, "sensor": SENSOR}
@@ -37,12 +33,6 @@ def test_the_simulated_arm_runs_over_the_wire(
     lines = capsys.readouterr().out.splitlines()
     assert 20 < len(lines) <= MAX_TICKS and "features 0." in lines[0]
     assert lines[-1] != "inserted"  # a policy of random weights
-
-
-def test_the_simulated_arm_refuses_a_policy_for_another_robot(
-    served_policy: Callable[..., Any], serving: Callable[..., Any]
-) -> None:
-    server = serving(served_policy())  # whose channels have other names
-    main = runpy.run_path(str(ROOT / "examples" / "simulated_arm.py"))["main"]
+    other = serving(served_policy())  # whose channels have other names
     with pytest.raises(CheckpointMismatch, match=r'state: \["joint_0"'):
-        main(f"ws://{server.address}", 78)
+        main(f"ws://{other.address}", 78)

@@ -78,20 +78,16 @@ def arm_of(robot: Follower, **changed: Any) -> LeRobotArm:
     return LeRobotArm(robot, metadata_of(**changed), {"View1": "front"}, clock_s=Clock())
 
 
-def test_one_observation_a_tick_gives_state_time_and_frames() -> None:
-    robot = Follower()
-    arm = arm_of(robot, state=("gripper", "shoulder_pan"))
+def test_one_observation_a_tick_gives_state_time_and_frames_and_actions_go_by_name() -> None:
+    """An image is older than the call that gave it by the camera's latency."""
+    robot, names = Follower(), ("gripper.pos", "elbow_flex", "shoulder_pan.pos")
+    metadata = metadata_of(state=("gripper", "shoulder_pan"), action=names)
+    arm = LeRobotArm(robot, metadata, {"View1": "front"}, None, Clock(), 0.125)
     observed = arm.observe()
     assert observed["state"].tolist() == [[2.0, 0.0]] and observed["state"].dtype == np.float32
     assert (observed["state_time"].tolist(), observed["time"].tolist()) == ([100.25], [100.5])
     ((view, (time_s, image)),) = arm.frames().items()
-    assert (view, time_s, image is robot.image, robot.asked) == ("View1", 100.25, True, 1)
-
-
-def test_absolute_actions_go_to_the_motors_that_the_channels_name() -> None:
-    robot = Follower()
-    arm = arm_of(robot, action=("gripper.pos", "elbow_flex", "shoulder_pan.pos"))
-    arm.observe()
+    assert (view, time_s, image is robot.image, robot.asked) == ("View1", 100.125, True, 1)
     arm.act(np.array([7, 8, 9], np.float32))
     assert robot.sent == [{"gripper.pos": 7.0, "elbow_flex.pos": 8.0, "shoulder_pan.pos": 9.0}]
 
@@ -107,13 +103,6 @@ def test_deltas_add_up_on_what_was_sent_and_not_on_what_is_measured() -> None:
     assert places == [[0.5, 1.5, 1.0], [1.0, 1.75, 1.0], [1.5, 1.75, 1.0]]
     arm.act(np.array([0, -0.5, 1.0]))  # from where the robot clipped, at once back again
     assert robot.sent[-1]["elbow_flex.pos"] == 1.25
-
-
-def test_an_image_is_older_than_the_call_that_gave_it_by_the_cameras_latency() -> None:
-    metadata = metadata_of()
-    arm = LeRobotArm(Follower(), metadata, {"View1": "front"}, None, Clock(), 0.125)
-    assert arm.observe()["state_time"].tolist() == [100.25]
-    assert arm.frames()["View1"][0] == 100.125
 
 
 @pytest.mark.parametrize("copies", [False, True])
@@ -135,6 +124,8 @@ def test_a_camera_that_hangs_becomes_old(copies: bool) -> None:
 def test_stop_holds_where_the_robot_was_last_seen_without_asking_and_deltas_begin_there() -> None:
     robot = Follower()
     arm = arm_of(robot, kind="delta", moving=(True, True, True))
+    arm.stop("no server")
+    assert robot.sent == [], "nothing was seen yet"
     arm.observe()
     arm.act(np.array([5.0, 5.0, 5.0]))
     robot.broken = True
@@ -142,12 +133,6 @@ def test_stop_holds_where_the_robot_was_last_seen_without_asking_and_deltas_begi
     assert (robot.sent[-1], robot.asked) == (robot.place, 1)
     arm.act(np.zeros(3))
     assert robot.sent[-1] == robot.place
-
-
-def test_stop_before_anything_was_seen_sends_nothing() -> None:
-    robot = Follower()
-    arm_of(robot).stop("no server")
-    assert robot.sent == []
 
 
 class Blocked(Follower):
@@ -163,53 +148,50 @@ class Blocked(Follower):
         self.log.append("begin")
         if first:
             self.begun.set()
-            self.go.wait(10)
+            self.go.wait(60)
         self.log.append("end")
         return super().send_action(action)
 
 
 @pytest.mark.parametrize("hangs", [False, True])
 def test_stop_waits_for_a_command_under_way_but_not_for_one_that_hangs(
-    hangs: bool, monkeypatch: pytest.MonkeyPatch
+    hangs: bool, monkeypatch
 ) -> None:
-    monkeypatch.setattr("pipeline.robot.lerobot_arm._PORT_S", 0.05 if hangs else 10.0)
+    monkeypatch.setattr("pipeline.robot.lerobot_arm._PORT_S", 0.05 if hangs else 60.0)
     robot, said = Blocked(), list[str]()
     arm = LeRobotArm(robot, metadata_of(), {"View1": "front"}, say=said.append)
     arm.observe()
     acting = threading.Thread(target=arm.act, args=(np.ones(3),))
     acting.start()
-    assert robot.begun.wait(10)
+    assert robot.begun.wait(60)
     stopping = threading.Thread(target=arm.stop, args=("no tick has ended",))
     stopping.start()
-    stopping.join(10 if hangs else 0.1)
     if hangs:
+        stopping.join(60)
         assert robot.sent == [robot.place]
         assert len(said) == 1 and "(no tick has ended) was sent while another call" in said[0]
     robot.go.set()
-    acting.join(10)
-    stopping.join(10)
+    acting.join(60)
+    stopping.join(60)
     if not hangs:
         assert robot.log == ["begin", "end"] * 2
         assert (robot.sent[-1], said) == (robot.place, [])
 
 
-def test_a_robot_is_described_by_the_policys_names() -> None:
-    said = describe(Follower(), {"View1": "front"}, {"joint_1": "shoulder_pan.pos"})
-    names = ["joint_1", "elbow_flex.pos", "gripper.pos"]
-    assert said == {
-        "state": names, "action": names, "action_kind": "absolute", "views": ["View1"],
-    }  # fmt: skip
-
-
-def test_names_that_differ_are_mapped() -> None:
+def test_names_that_differ_are_mapped_and_describe_the_robot() -> None:
     names = ("joint_1", "joint_2", "jaw")
     motors = {name: f"{motor}.pos" for name, motor in zip(names, MOTORS, strict=True)}
-    metadata = metadata_of(action=names, state=names)
-    robot = Follower()
-    arm = LeRobotArm(robot, metadata, {"View1": "front"}, motors)
+    robot, cameras = Follower(), {"View1": "front"}
+    arm = LeRobotArm(robot, metadata_of(action=names, state=names), cameras, motors)
     assert arm.observe()["state"].tolist() == [[0.0, 1.0, 2.0]]
     arm.act(np.array([1.0, 2.0, 3.0]))
     assert list(robot.sent[0].values()) == [1.0, 2.0, 3.0]
+    assert describe(robot, cameras, {"joint_1": "shoulder_pan.pos"}) == {
+        "state": (own := ["joint_1", "elbow_flex.pos", "gripper.pos"]),
+        "action": own,
+        "action_kind": "absolute",
+        "views": ["View1"],
+    }
 
 
 @pytest.mark.parametrize(
@@ -217,9 +199,7 @@ def test_names_that_differ_are_mapped() -> None:
     [
         ({"state": ("wrist",)}, "needs wrist, found no wrist or wrist.pos"),
         ({"action": MOTORS[:2], "moving": (False,) * 2}, r"none for \['gripper.pos'\]"),
-        ({"action": ("a", "b", "c")}, "needs a, found no a or a.pos"),
         ({"kind": "velocity"}, "needs actions that are velocity, found places"),
-        ({"kind": "torque"}, "needs actions that are torque, found places"),
         ({"views": ("View1", "View2")}, "needs View2, found no View2"),
         ({"views": ()}, r"needs mappings of what it has, found \['View1'\]"),
     ],
@@ -305,7 +285,7 @@ def example(monkeypatch: pytest.MonkeyPatch, simulated_time: Any) -> Any:
     return module
 
 
-def test_the_example_drives_a_robot_and_records_it(example: Any, tmp_path: Path) -> None:
+def test_the_example_drives_a_robot_and_records_it(example: Any, tmp_path) -> None:
     robot = Filming()
     example.drive(robot, RunSettings("Push", seconds=1.0), tmp_path)
     (root,) = tmp_path.iterdir()
@@ -320,27 +300,18 @@ def test_the_example_drives_a_robot_and_records_it(example: Any, tmp_path: Path)
     assert json.loads((root / "run.json").read_text())["settings"]["seconds"] == 1.0
 
 
-@pytest.mark.parametrize(("far", "most"), [(90.0, 1.0), (10.0, 2.8)])
-def test_the_example_keeps_its_limits(
-    example: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, far: float, most: float
+def test_the_example_makes_too_fast_a_step_slower_and_stops_before_too_large_a_one(
+    example: Any, tmp_path, monkeypatch, capsys
 ) -> None:
-    """Too large a step stops the robot before it moves; too fast a one is made slower."""
-    monkeypatch.setattr(Policy, "far", far)
+    """The run that a first action beyond a limit stops is kept."""
+    monkeypatch.setattr(Policy, "far", 10.0)
     robot = Filming()
-    settings = RunSettings("Push", seconds=0.3)
-    example.drive(robot, settings, tmp_path)
-    assert robot.sent[0]["shoulder_lift.pos"] <= most + 0.01
-    assert (len(robot.sent) == 1) == (far == 90.0)
-
-
-def test_the_example_keeps_the_run_that_a_first_action_beyond_a_limit_stops(
-    example: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any
-) -> None:
+    example.drive(robot, RunSettings("Push", seconds=0.3), tmp_path / "slower")
+    assert robot.sent[0]["shoulder_lift.pos"] <= 2.81 and len(robot.sent) > 1
     monkeypatch.setattr(Policy, "far", 90.0)
-    robot = Filming()
+    robot, root = Filming(), tmp_path / "run_000000"
     example.drive(robot, RunSettings("Push", seconds=5.0), tmp_path)
-    assert len(robot.sent) == 1, "the stop alone"
-    root = tmp_path / "run_000000"
+    assert robot.sent == [robot.place], "the stop alone"
     printed = capsys.readouterr().out.rstrip()
     assert "step of shoulder" in printed and printed.endswith(f": {root}")
     (recording,) = open_recordings([Source(name="runs", path=str(root))], tmp_path).recordings
@@ -350,7 +321,7 @@ def test_the_example_keeps_the_run_that_a_first_action_beyond_a_limit_stops(
 
 
 def test_the_example_says_why_a_run_without_an_observation_is_not_recorded(
-    example: Any, tmp_path: Path, capsys: Any
+    example: Any, tmp_path, capsys
 ) -> None:
     def fail(self: Filming) -> dict[str, Any]:
         raise RuntimeError("bus error")
@@ -363,10 +334,6 @@ def test_the_example_says_why_a_run_without_an_observation_is_not_recorded(
     assert f"{tmp_path / 'run_000000.part'}: expected a tick" in printed
 
 
-def test_the_example_refuses_a_policy_for_another_robot(example: Any, tmp_path: Path) -> None:
+def test_the_example_refuses_a_policy_for_another_robot(example: Any, tmp_path) -> None:
     with pytest.raises(CheckpointMismatch, match="trained on another robot"):
         example.drive(Follower(), RunSettings("Push"), tmp_path)
-
-
-def test_the_example_is_short() -> None:
-    assert len(EXAMPLE.read_text().splitlines()) <= 40

@@ -1,27 +1,307 @@
-"""One robot's loop: what is due when, and when the robot stands still."""
+"""Which step of which chunk is played, what is due in a tick, when a robot stands still."""
+
+from collections.abc import Iterator
+from itertools import product
+from typing import get_args
 
 import numpy as np
 import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
 
-from pipeline.robot.chunking import Executor
-from pipeline.robot.loop import ControlLoop, SafeStop, StopKind
+from pipeline.base.config import Chunking
+from pipeline.base.errors import ConfigError
+from pipeline.robot.loop import (
+    ControlLoop,
+    Executor,
+    PlanGuide,
+    SafeStop,
+    StopKind,
+    check_chunking,
+    soft_mask,
+)
+from pipeline.robot.session import stack_guides
 
-HORIZON, ACTION = 4, 2
+MODES = get_args(Chunking)
+HORIZON = 8
+
+
+def chunk_of(tick: int, name: float = 0.0, horizon: int = HORIZON) -> np.ndarray:
+    """A chunk whose steps say the tick that they are for, and which chunk they are of."""
+    return np.stack([tick + np.arange(horizon), np.full(horizon, name)], axis=1)
+
+
+def take(executor: Executor, chunk: np.ndarray) -> None:
+    """Observe, and plan the chunk at once."""
+    executor.begin()
+    executor.plan(chunk)
+
+
+def play(executor: Executor, steps: int) -> list[float]:
+    """The ticks that the next actions are for."""
+    return [float(executor.next_action()[0]) for _ in range(steps)]
+
+
+class TestDue:
+    @pytest.mark.parametrize(("chunking", "execute"), [*zip(MODES, (1, 3, HORIZON), strict=True)])
+    def test_it_is_before_the_first_chunk_and_every_so_many_steps(
+        self, chunking: Chunking, execute: int
+    ) -> None:
+        executor, observed = Executor(chunking, execute, HORIZON), []
+        for tick in range(20):
+            if executor.due:
+                take(executor, chunk_of(tick))
+                observed.append(tick)
+            assert not executor.due
+            assert executor.next_action()[0] == tick
+        assert observed == list(range(0, 20, execute))
+
+    def test_while_a_chunk_is_computed_no_other_is_due_and_a_late_one_is_as_old_as_its_observation(
+        self,
+    ) -> None:
+        executor = Executor("none", 4, HORIZON)
+        executor.begin()
+        assert not executor.due
+        executor.plan(chunk_of(0))
+        play(executor, 4)
+        assert executor.due
+        executor.begin()
+        play(executor, 3)
+        assert not executor.due
+        executor.plan(chunk_of(4))
+        assert not executor.due
+        play(executor, 1)
+        assert executor.due
+
+    @pytest.mark.parametrize("execute", [0, 9])
+    def test_more_steps_than_a_chunk_has_are_refused(self, execute: int) -> None:
+        with pytest.raises(ConfigError, match=rf"rollout\.execute: expected 1 to 8.*{execute}"):
+            Executor("none", execute, HORIZON)
+
+
+@pytest.mark.parametrize("chunking", MODES)
+class TestSteps:
+    def test_a_chunk_used_up_gives_no_action_and_a_second_begin_replaces_the_first(
+        self, chunking: Chunking
+    ) -> None:
+        executor = Executor(chunking, 2, HORIZON)
+        with pytest.raises(AssertionError, match="begin"):
+            executor.plan(chunk_of(0))
+        with pytest.raises(AssertionError, match="no action at tick 0"):
+            executor.next_action()
+        take(executor, chunk_of(0))
+        executor.begin()
+        play(executor, 3)
+        take(executor, chunk_of(3))
+        executor.begin()
+        assert play(executor, HORIZON) == list(range(3, 3 + HORIZON))
+        executor.plan(chunk_of(3))
+        assert executor.due
+        with pytest.raises(AssertionError, match="no action at tick 11"):
+            executor.next_action()
+
+    def test_reset_forgets_the_episode(self, chunking: Chunking) -> None:
+        executor = Executor(chunking, 1, HORIZON, [True, False])
+        for _ in range(3):
+            take(executor, chunk_of(100))
+            play(executor, 1)
+        executor.begin()
+        executor.reset()
+        assert executor.due and executor.begin() is None
+        executor.plan(np.ones((HORIZON, 2)))
+        assert play(executor, 2) == [1, 1]
+
+    def test_a_chunk_is_copied(self, chunking: Chunking) -> None:
+        executor, buffer = Executor(chunking, 2, HORIZON), chunk_of(0)
+        take(executor, buffer)
+        buffer[:] = -1
+        action = executor.next_action()
+        action[:] = -1
+        assert play(executor, 2) == [1, 2] and action.dtype == np.float32
+
+    @given(st.lists(st.tuples(st.booleans(), st.integers(0, 3)), max_size=30))
+    def test_whatever_the_delays_every_step_is_that_of_its_tick(
+        self, chunking: Chunking, turns: list[tuple[bool, int]]
+    ) -> None:
+        """Others drop as many steps as the computation is believed to have taken."""
+        executor, tick = Executor(chunking, 1, HORIZON), 0
+        take(executor, chunk_of(0))
+        for again, delay in turns:
+            for _ in range(1 + again):
+                executor.begin()
+            begun = tick
+            assert play(executor, delay) == list(range(tick, tick + delay))
+            tick += delay
+            executor.plan(chunk_of(begun))
+            assert play(executor, 1) == [tick]
+            tick += 1
+
+
+@pytest.mark.parametrize("chunking", MODES)
+def test_temporal_averages_all_chunks_that_reach_a_tick_and_others_play_the_newest(
+    chunking: Chunking,
+) -> None:
+    """In closed form: the newest weighs most."""
+    executor, horizon = Executor(chunking, 1, 3), 3
+    names = [5.0, -1.0, 2.0, 8.0]
+    for tick, name in enumerate(names):
+        take(executor, chunk_of(tick, name, horizon))
+        reach = names[max(0, tick - horizon + 1) : tick + 1]
+        weights = [np.exp(0.2 * i) for i in range(len(reach))]
+        mean = sum(w * n for w, n in zip(weights, reach, strict=True)) / sum(weights)
+        expected = mean if chunking == "temporal" else name
+        assert executor.next_action().tolist() == pytest.approx([tick, expected])
+
+
+class TestMoving:
+    """Channels that say how far to move: what counts is where a chunk leads to."""
+
+    @staticmethod
+    def executor(chunking: Chunking = "none", execute: int = 1) -> Executor:
+        return Executor(chunking, execute, HORIZON, [True, False])
+
+    @staticmethod
+    def deltas(step: float, place: float = 7.0) -> np.ndarray:
+        return np.tile(np.array([step, place], np.float32), (HORIZON, 1))
+
+    @given(st.data(), st.sampled_from(["none", "rtc"]), st.integers(1, HORIZON))
+    def test_a_chunk_in_time_is_played_as_it_is(
+        self, data: st.DataObject, chunking: Chunking, execute: int
+    ) -> None:
+        executor, steps = self.executor(chunking, execute), st.floats(-3, 3, width=32)
+        for _ in range(4):
+            chunk = np.array([[data.draw(steps), 7.0] for _ in range(HORIZON)], np.float32)
+            take(executor, chunk)
+            played = np.stack([executor.next_action() for _ in range(execute)])
+            np.testing.assert_allclose(played, chunk[:execute], atol=1e-6)
+
+    def test_a_late_chunk_leads_to_where_it_meant_to_and_the_guide_is_what_will_be_played(
+        self,
+    ) -> None:
+        """What an older chunk moved meanwhile is not moved again."""
+        executor = self.executor("rtc")
+        take(executor, self.deltas(1.0))
+        executor.next_action()
+        executor.begin()
+        assert play(executor, 3) == [1, 1, 1]
+        executor.plan(self.deltas(-2.0, place=9.0))
+        guide = executor.begin()
+        # Its fourth step ends 8 below where it was asked for; the robot was sent 3 above that.
+        assert guide is not None and guide.chunk[:2].tolist() == [[-11, 9], [-2, 9]]
+        assert executor.next_action().tolist() == [-11, 9]
+        assert executor.next_action().tolist() == [-2, 9]
+
+    def test_ensembles_average_places(self) -> None:
+        executor = self.executor("temporal")
+        sent, plans = 0.0, []
+        for step in (1.0, -1.0, 0.5, 0.0):
+            take(executor, self.deltas(step))
+            plans.append(sent + step * np.arange(1, HORIZON + 1))
+            now = [plan[len(plans) - 1 - begun] for begun, plan in enumerate(plans)]
+            place = np.average(now, weights=np.exp(0.2 * np.arange(len(now))))
+            action = executor.next_action()
+            assert action.tolist() == pytest.approx([place - sent, 7.0])
+            sent = place
+
+    def test_plans_that_agree_move_as_each_of_them(self) -> None:
+        """Deltas of other ticks do not: averaged, a robot that slows down never arrives."""
+        executor, sent = self.executor("temporal"), 0.0
+        for tick in range(30):
+            places = 1 - 0.5 ** (1 + tick + np.arange(HORIZON))
+            take(executor, np.diff(places, prepend=sent)[:, None] * [1, 0])
+            sent += float(executor.next_action()[0])
+            assert sent == pytest.approx(places[0])
+
+    def test_what_was_cut_off_is_made_up_for_but_not_where_a_channel_says_where_to_be(self) -> None:
+        executor = Executor("none", 3, 4, (True, True, False))
+        take(executor, np.array([[1, 1, 5], [1, 1, 6], [1, 1, 7], [1, 1, 8]], np.float32))
+        assert executor.next_action().tolist() == [1, 1, 5]
+        executor.sent([0.25, 1, 2])
+        assert executor.next_action().tolist() == [1.75, 1, 6]
+        executor.sent([1, 1, 6])
+        assert executor.next_action().tolist() == [1.75, 1, 7]
+        executor.sent([0.25, 0.25, 7])
+        take(executor, np.ones((4, 3), np.float32))  # counts from where the robot was really sent
+        assert executor.next_action().tolist() == [1, 1, 1]
+
+
+class TestGuide:
+    @staticmethod
+    def under_way(execute: int = 3, played: int = 3) -> Executor:
+        executor = Executor("rtc", execute, HORIZON)
+        take(executor, chunk_of(0) + 1)
+        play(executor, played)
+        return executor
+
+    @pytest.mark.parametrize(("played", "execute"), [(0, 3), (3, 5), (7, 1)])
+    def test_it_is_the_rest_of_the_plan_and_what_the_plan_does_not_reach_weighs_nothing(
+        self, played: int, execute: int
+    ) -> None:
+        """Zeros with weight would decode to the mean action."""
+        executor = self.under_way(execute, played)
+        guide = executor.begin()
+        assert guide is not None
+        assert np.array_equal(guide.chunk[: HORIZON - played], chunk_of(played)[: 8 - played] + 1)
+        ends = HORIZON - max(played, execute)
+        assert (guide.weight[:ends] > 0).all() and (guide.weight[ends:] == 0).all()
+        assert (guide.chunk[guide.weight > 0] > 0).all()
+        guide.chunk[:] = -1
+        assert play(executor, 1) == [played + 1], "the plan stays as it is"
+
+    def test_as_many_steps_are_held_as_any_of_the_last_ten_chunks_took(self) -> None:
+        executor, held = self.under_way(execute=1), []
+        for delay in (2, 1, *[0] * 11):
+            guide = executor.begin()
+            assert guide is not None
+            held.append(int((guide.weight == 1).sum()))
+            play(executor, delay)
+            executor.plan(chunk_of(0))
+        assert held == [0, *[2] * 10, 1, 0]
+
+    def test_there_is_none_in_other_modes_before_a_plan_and_at_its_end(self) -> None:
+        for chunking in MODES:
+            executor = Executor(chunking, 3, HORIZON)
+            assert executor.begin() is None
+            executor.plan(chunk_of(0))
+            assert (executor.begin() is None) == (chunking != "rtc")
+        assert self.under_way(played=HORIZON).begin() is None
+        assert self.under_way(execute=HORIZON, played=4).begin() is None
+
+    def test_the_mask_is_that_of_the_paper(self) -> None:
+        """Eq. 5 written out, H = 10, s = 3, d = 2."""
+        c = [5 / 6, 4 / 6, 3 / 6, 2 / 6, 1 / 6]
+        falling = [x * (np.e**x - 1) / (np.e - 1) for x in c]
+        expected = [1, 1, *falling, 0, 0, 0]
+        np.testing.assert_allclose(soft_mask(10, 2, 7), expected, rtol=1e-6)
+        for delay, overlap in product(range(HORIZON + 2), range(1, HORIZON + 1)):
+            weight = soft_mask(HORIZON, delay, overlap)
+            assert weight.dtype == np.float32 and (np.diff(weight) <= 0).all()
+            assert np.array_equal(weight == 1, np.arange(HORIZON) < min(delay, overlap))
+            assert np.array_equal(weight > 0, np.arange(HORIZON) < overlap)
+
+    def test_robots_without_a_plan_weigh_nothing_in_a_batch(self) -> None:
+        plan = PlanGuide(np.full((4, 2), 3, np.float32), np.full(4, 0.5, np.float32))
+        guide = stack_guides([None, plan, None], torch.device("cpu"))
+        assert guide is not None and guide.chunk.shape == (3, 4, 2)
+        assert guide.weight.tolist() == [[0] * 4, [0.5] * 4, [0] * 4]
+        assert guide.chunk.sum(dim=(1, 2)).tolist() == [0, 24, 0]
+        assert stack_guides([None, None], torch.device("cpu")) is None
+
+    def test_a_policy_that_draws_nothing_cannot_be_guided(self) -> None:
+        with pytest.raises(ConfigError, match=r"rollout\.chunking: .*found rtc"):
+            check_chunking("rtc", stochastic=False)
+        for chunking, stochastic in (("rtc", True), ("none", False), ("temporal", False)):
+            check_chunking(chunking, stochastic)
 
 
 def make_loop(execute: int = 1, uses_features: bool = True) -> ControlLoop:
-    return ControlLoop(Executor("none", execute, HORIZON, (False, False)), 3, uses_features)
+    return ControlLoop(Executor("none", execute, HORIZON), 3, uses_features)
 
 
-def chunk_of(tick: int) -> np.ndarray:
-    """A chunk whose steps say the tick that they are for."""
-    return np.repeat(tick + np.arange(HORIZON, dtype=np.float32)[:, None], ACTION, axis=1)
-
-
-def run(loop: ControlLoop, ticks: int, latency: int = 0) -> list[tuple[bool, bool, float | None]]:
+def run(loop: ControlLoop, ticks: int, latency: int = 0) -> Iterator[tuple[bool, bool, float]]:
     """Of every tick: whether a pass began, which ends `latency` ticks later, whether a chunk was
-    asked for, and the first channel of the action, which says the tick that it is meant for."""
-    log: list[tuple[bool, bool, float | None]] = []
+    asked for, and the tick that the action is meant for, -1 without one."""
     ends, seen = -1, False
     for tick in range(ticks):
         loop.begin_tick()
@@ -36,27 +316,30 @@ def run(loop: ControlLoop, ticks: int, latency: int = 0) -> list[tuple[bool, boo
             seen = True
         if asked := seen and loop.chunk_due:
             loop.ask()
-            loop.plan(chunk_of(tick + 1))
+            loop.plan(chunk_of(tick))
         action = loop.action()
-        log.append((due, asked, None if action is None else float(action[0])))
-    return log
+        yield due, asked, -1 if action is None else float(action[0])
 
 
-def test_the_model_is_asked_every_third_tick_and_the_head_every_tick() -> None:
-    log = run(make_loop(), 7)
-    assert [began for began, *_ in log] == [True, False, False] * 2 + [True]
-    assert all(asked for _, asked, _ in log)
-
-
-def test_a_chunk_is_played_for_as_many_steps_as_are_executed() -> None:
-    log = run(make_loop(execute=3), 7)
-    assert [asked for _, asked, _ in log] == [True, False, False] * 2 + [True]
-    assert [action for *_, action in log] == [1, 2, 3, 4, 5, 6, 7]
-
-
-def test_a_slow_model_is_asked_again_when_it_is_free() -> None:
-    log = run(make_loop(), 12, latency=5)
-    assert [tick for tick, (began, *_) in enumerate(log) if began] == [0, 5, 10]
+@pytest.mark.parametrize(
+    ("execute", "latency", "passes", "asked"),
+    [
+        (1, 0, [0, 3, 6, 9], [*range(12)]),
+        (3, 0, [0, 3, 6, 9], [0, 3, 6, 9]),
+        (1, 5, [0, 5, 10], [*range(5, 12)]),  # a slow model is asked again when it is free
+    ],
+)
+def test_the_model_looks_every_third_tick_and_the_head_answers_as_often_as_it_is_asked(
+    execute: int, latency: int, passes: list[int], asked: list[int]
+) -> None:
+    """A robot stands still until its first chunk is there; the next episode begins with nothing."""
+    loop = make_loop(execute)
+    for _ in range(2):
+        loop.reset()
+        log = [*run(loop, 12, latency)]
+        assert [tick for tick, (began, *_) in enumerate(log) if began] == passes
+        assert [tick for tick, (_, wanted, _) in enumerate(log) if wanted] == asked
+        assert [tick for *_, tick in log] == [*[-1] * latency, *range(latency, 12)]
 
 
 def test_a_policy_without_features_needs_no_frames() -> None:
@@ -65,18 +348,14 @@ def test_a_policy_without_features_needs_no_frames() -> None:
     assert not loop.frames_due and loop.chunk_due
 
 
-def test_what_was_refused_is_asked_again_with_frames() -> None:
+def test_a_refused_question_is_asked_again_with_its_frames_and_no_other_pass_is_touched() -> None:
     loop = make_loop()
-    loop.begin_tick()
-    loop.pass_began()
-    loop.ask()
-    loop.begin_tick()
-    loop.refused()
-    assert loop.frames_due and loop.chunk_due
-
-
-def test_a_refusal_leaves_a_pass_of_an_earlier_question_alone() -> None:
-    loop = make_loop()
+    for _ in range(2):
+        loop.begin_tick()
+        assert loop.frames_due and loop.chunk_due
+        loop.pass_began()
+        loop.ask()
+        loop.refused()
     loop.begin_tick()
     loop.pass_began()
     loop.ask()
@@ -92,34 +371,6 @@ def test_a_refusal_leaves_a_pass_of_an_earlier_question_alone() -> None:
     assert loop.frames_due
 
 
-def test_a_robot_stands_still_until_its_first_chunk_is_there() -> None:
-    log = run(make_loop(), 6, latency=3)
-    assert [asked for _, asked, _ in log] == [False] * 3 + [True] * 3
-    assert [action for *_, action in log] == [None, None, None, 4, 5, 6]
-
-
-def test_steps_played_while_a_chunk_is_computed_are_skipped_and_no_others() -> None:
-    """A head that takes two ticks, after a first chunk that took as long and played nothing."""
-    loop = make_loop(execute=2, uses_features=False)
-    loop.begin_tick()
-    loop.ask()
-    loop.begin_tick()  # the warm-up: time goes by, no step is played
-    loop.plan(chunk_of(1))
-    played, asked = [], None
-    for tick in range(1, 12):
-        loop.begin_tick()
-        if asked is not None and tick - asked == 2:
-            loop.plan(chunk_of(asked))
-            asked = None
-        if asked is None and loop.chunk_due:
-            loop.ask()
-            asked = tick
-        action = loop.action()
-        assert action is not None
-        played.append(float(action[0]))
-    assert played == list(range(1, 12))
-
-
 def test_a_plan_that_is_used_up_is_a_safe_stop() -> None:
     loop = make_loop(uses_features=False)
     loop.begin_tick()
@@ -132,19 +383,12 @@ def test_a_plan_that_is_used_up_is_a_safe_stop() -> None:
     assert stopped.value.kind == StopKind.NO_CHUNK
 
 
-def test_the_next_episode_begins_with_nothing() -> None:
-    loop = make_loop()
-    first = run(loop, 5)
-    loop.reset()
-    assert run(loop, 5) == first
-
-
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
 def test_an_action_that_is_no_number_is_a_safe_stop(bad: float) -> None:
     loop = make_loop(uses_features=False)
     loop.begin_tick()
     loop.ask()
-    chunk = np.zeros((HORIZON, ACTION), np.float32)
+    chunk = np.zeros((HORIZON, 2), np.float32)
     chunk[-1, 1] = bad
     with pytest.raises(SafeStop, match="not a number") as stopped:
         loop.plan(chunk)

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from pipeline.base.errors import ConfigError, ObservationError
-from pipeline.robot.key_maps import KEY_MAPS
-from pipeline.robot.observation import Doubts, ObservationReader
+from pipeline.robot.observation import KEY_MAPS, Doubts, ObservationReader
 from pipeline.simulation.rendering import VIEWS
 
 Observe = Callable[..., dict[str, Any]]
@@ -36,7 +35,7 @@ def reader() -> ObservationReader:
     return ObservationReader(METADATA)
 
 
-def test_what_is_whole_is_read(reader: ObservationReader, observe: Observe) -> None:
+def test_what_is_whole_is_read(reader, observe) -> None:
     given = observe(0, reset=np.int64(3), prompt="go", **{"images_time/View5": np.float32(0.05)})
     given["state"] = given["state"].astype(">f8")
     given["time"] = 0.1
@@ -48,15 +47,13 @@ def test_what_is_whole_is_read(reader: ObservationReader, observe: Observe) -> N
     np.testing.assert_allclose(read.frame_time_s, [0.1, 0.1, 0.05])
 
 
-def test_whatever_is_missing_is_missing(reader: ObservationReader) -> None:
+def test_whatever_is_missing_is_missing(reader) -> None:
     read = reader.read({"time": np.array([1.0])})
     assert set(read.readings) == {"time"} and read.frames == {} and read.guide is None
     assert np.isnan(read.frame_time_s).all() and (read.reset, read.seed) == (False, None)
 
 
-def test_without_a_time_an_observation_is_of_its_newest_reading(
-    reader: ObservationReader, observe: Observe
-) -> None:
+def test_without_a_time_an_observation_is_of_its_newest_reading(reader, observe) -> None:
     last = observe(0)["sensor_time"][-1]
     timed = observe(0, time=None, **{"images_time/View5": last + 0.02})
     assert reader.read(timed).time_s == last + 0.02
@@ -67,9 +64,7 @@ def test_without_a_time_an_observation_is_of_its_newest_reading(
         reader.read({"state": STATE[:1], "state_time": [0.15]})
 
 
-def test_without_any_time_an_observation_is_of_this_machines_clock(
-    reader: ObservationReader, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_without_any_time_an_observation_is_of_this_machines_clock(reader, monkeypatch) -> None:
     for now in (7.0, 7.5):
         monkeypatch.setattr("pipeline.robot.observation.monotonic", lambda now=now: now)
         read = reader.read({"state": STATE[:1], "images/View1": FRAME})
@@ -77,20 +72,14 @@ def test_without_any_time_an_observation_is_of_this_machines_clock(
         assert read.frame_time_s[0] == now
 
 
-def test_a_single_reading_without_its_time_is_of_the_observations(
-    reader: ObservationReader, observe: Observe
-) -> None:
+def test_a_single_reading_without_its_time_is_of_the_observations(reader, observe) -> None:
     read = reader.read(observe(0, state=STATE[:1], state_time=None))
     assert read.readings["state_time"].tolist() == [0.1]
     for several in (STATE[:2], STATE[:0]):
         with pytest.raises(ObservationError, match="state_time: expected it beside state"):
             reader.read(observe(1, state=several, state_time=None))
-    reader.read(observe(1))
-
-
-def test_a_stream_without_readings_is_missing(reader: ObservationReader, observe: Observe) -> None:
-    read = reader.read(observe(0, state=STATE[:0], state_time=[]))
-    assert set(read.readings) == {"time", "sensor", "sensor_time"}
+    read = reader.read(observe(1, state=STATE[:0], state_time=[]))
+    assert set(read.readings) == {"time", "sensor", "sensor_time"}, "without readings it is missing"
 
 
 FRAME = np.zeros((4, 4, 3), np.uint8)
@@ -102,26 +91,20 @@ STATE, STATE_TIME = np.zeros((10, 12)), np.arange(1, 11) / 100
     [
         ({"observation/state": STATE}, "observation/state: expected one of time, .*state_time"),
         ({"images/left": FRAME}, "images/left: expected one of .*images/View1"),
-        ({"time": "now"}, "time: expected numbers, found str"),
         ({"time": np.zeros(2)}, r"time: expected shape \(1\), found \(2,\)"),
-        ({"time": np.nan}, "time: expected finite numbers, found nan"),
-        ({"state": None}, "state: expected it beside state_time"),
         ({"state_time": None}, "state_time: expected it beside state"),
         ({"state": np.zeros((10, 11))}, r"state: expected shape \(reading, 12\), found \(10, 11\)"),
         ({"state": [[1], [2, 3]]}, "state: expected numbers, found list"),
-        ({"state": STATE.astype(str)}, "state: expected numbers"),
         ({"state": changed(STATE, (3, 2), np.nan)}, r"found nan at \(3, 2\)"),
         ({"state": changed(STATE, (0, 0), 1e300)}, r"found inf at \(0, 0\)"),
         ({"state_time": STATE_TIME[:9]}, r"state_time: expected shape \(10\), found \(9,\)"),
         ({"state_time": STATE_TIME[::-1]}, "state_time: expected times .*in order"),
         ({"state_time": STATE_TIME + 1}, r"state_time: expected times to 0\.1 s"),
-        ({"images/View1": FRAME[..., :2]}, "images/View1: expected RGB"),
         ({"images/View1": FRAME[:0]}, r"found shape \(0, 4, 3\)"),
         ({"images/View1": FRAME.astype(np.float32)}, "of float32"),
         ({"images/View1": b"jpeg"}, "images/View1: expected an array, found bytes"),
         ({"images/View1": None, "images_time/View1": 0.0}, "images/View1: expected it beside"),
         ({"images_time/View1": 7.0}, r"images_time/View1: expected times .*0\.1 s"),
-        ({"prompt": 7}, "prompt: expected a text"),
         ({"prompt": "x" * 1001}, "prompt: expected a text of at most 1000"),
         ({"reset": -1}, "reset: expected true, false or a seed"),
         ({"guide/chunk": np.zeros((4, 7))}, "guide/chunk: expected guide/chunk and guide/weight"),
@@ -130,7 +113,7 @@ STATE, STATE_TIME = np.zeros((10, 12)), np.arange(1, 11) / 100
     ],
 )
 def test_what_is_wrong_is_refused_by_name_and_leaves_no_trace(
-    reader: ObservationReader, observe: Observe, wrong: dict[str, Any], said: str
+    reader, observe, wrong: dict[str, Any], said: str
 ) -> None:
     with pytest.raises(ObservationError, match=said) as refused:
         reader.read(observe(0, **wrong))
@@ -138,15 +121,13 @@ def test_what_is_wrong_is_refused_by_name_and_leaves_no_trace(
     reader.read(observe(0))
 
 
-@pytest.mark.parametrize("given", [None, [], "time", 3, np.zeros(3)])
-def test_what_has_no_fields_is_refused(reader: ObservationReader, given: Any) -> None:
+@pytest.mark.parametrize("given", [None, np.zeros(3)])
+def test_what_has_no_fields_is_refused(reader, given: Any) -> None:
     with pytest.raises(ObservationError, match="expected fields by name"):
         reader.read(given)
 
 
-def test_observations_follow_one_another_until_a_reset(
-    reader: ObservationReader, observe: Observe
-) -> None:
+def test_observations_follow_one_another_until_a_reset(reader, observe) -> None:
     reader.read(observe(5))
     with pytest.raises(ObservationError, match=r"^time: .* reset where a new episode begins"):
         reader.read(observe(4))
@@ -156,7 +137,7 @@ def test_observations_follow_one_another_until_a_reset(
     reader.read(observe(5))
 
 
-def test_what_the_policy_lacks_is_refused(observe: Observe) -> None:
+def test_what_the_policy_lacks_is_refused(observe) -> None:
     streams = METADATA["streams"] | {"sensor": {"names": []}}
     lacking = ObservationReader(METADATA | {"streams": streams, "stochastic": False})
     with pytest.raises(ObservationError, match=r"sensor: expected one of .*this policy"):
@@ -166,7 +147,7 @@ def test_what_the_policy_lacks_is_refused(observe: Observe) -> None:
         lacking.read(observe(0, sensor=None, sensor_time=None) | guide)
 
 
-def test_fields_may_be_nested_and_a_single_reading_has_no_axis(reader: ObservationReader) -> None:
+def test_fields_may_be_nested_and_a_single_reading_has_no_axis(reader) -> None:
     flat = reader.read({"images/View1": FRAME, "state": STATE[:1], "time": 1.0})
     nested = reader.read({"images": {"View1": FRAME}, "state": STATE[0].tolist(), "time": 1.0})
     np.testing.assert_array_equal(nested.frames["View1"], flat.frames["View1"])
@@ -213,14 +194,15 @@ def test_what_does_not_fit_a_known_robot_is_refused() -> None:
         droid.refuse_more(["View1", "View2", "View3"])
 
 
-def test_what_cannot_be_true_is_doubted_once(reader: ObservationReader, observe: Observe) -> None:
+def test_what_cannot_be_true_is_doubted_once(reader, observe) -> None:
     doubts, state = Doubts(), np.zeros((1, 12))
     black = {"images/View1": np.zeros((4, 6, 3), np.uint8)}
     kept = {"images/View2": observe(0)["images/View2"]}
-    new = [
-        doubts.of(reader.read(observe(tick, state=state, state_time=None, **black, **kept)))
-        for tick in range(24)
-    ]
+    new: list[list[str]] = []
+    for tick in range(24):
+        given = observe(tick, state=state, state_time=None, **black, **kept)
+        doubts.look(reader.read(given))
+        new.append(doubts.take())
     assert [text.split(":")[0] for text in new[0]] == ["images/View1", "state"]
     still = [text for texts in new[1:] for text in texts]
     assert [text.split(" for")[0] for text in still] == [

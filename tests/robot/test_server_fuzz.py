@@ -11,7 +11,6 @@ from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from time import monotonic
 from typing import Any
 
 import msgpack
@@ -40,7 +39,7 @@ checkpoint, policy, glance = runpy.run_path(sys.argv[1])["build_policy"]()
 glance.passes = type("Forgetful", (list,), {"append": lambda *_: None})()
 glance.instructions = glance.passes
 params = ServeParams(port=0, max_message_mb=1, max_connections=64)
-served = ServedPolicy(checkpoint, policy, glance, "head", say=lambda line: None)
+served = ServedPolicy(checkpoint, policy, glance, "head")
 server = PolicyServer(served, params, None, listen(params))
 server.run(lambda: print(server.address, flush=True))
 """
@@ -90,17 +89,12 @@ def array_of(rng: np.random.Generator) -> Any:
 WRONG: list[Callable[[np.random.Generator], Any]] = [
     array_of,
     lambda rng: {b"__npgeneric__": True, b"dtype": "|u1", b"data": int(rng.integers(-9, 999))},
-    lambda rng: {b"__ndarray__": True},
-    lambda rng: None,
     lambda rng: "text" * int(rng.integers(0, 9999)),
-    lambda rng: rng.bytes(int(rng.integers(0, 99))),
     lambda rng: [[0] * 3] * int(rng.integers(0, 9999)),
     lambda rng: float(rng.choice([np.nan, np.inf, -np.inf, 1e308])),
     lambda rng: int(rng.choice([-1, 2**63 - 1, 0])),
-    lambda rng: bool(rng.integers(2)),
     lambda rng: {"a": {"b": {}}},
     lambda rng: rng.normal(size=rng.integers(0, 6, size=rng.integers(0, 5))),
-    lambda rng: np.full((10, 12), np.nan),
     lambda rng: rng.integers(0, 256, (rng.integers(0, 9), 3, 3), dtype=np.uint8),
     lambda rng: np.arange(10.0)[::-1],
 ]
@@ -119,23 +113,20 @@ def wrong_fields(rng: np.random.Generator, fields: dict[str, Any]) -> bytes:
 
 
 def wrong_bytes(rng: np.random.Generator, fields: dict[str, Any]) -> bytes:
-    """A good message cut short, with bytes turned, repeated or put into it."""
+    """A good message cut short, with bytes turned or put into it."""
     data = bytearray(wire.pack(fields))
-    kind = rng.integers(4)
-    if kind == 0:
+    if (kind := rng.integers(3)) == 0:
         return bytes(data[: rng.integers(len(data))])
     if kind == 1:
         for place in rng.integers(0, min(len(data), 300), rng.integers(1, 20)):
             data[place] = rng.integers(256)
-    elif kind == 2:
-        data[rng.integers(300) :] = rng.bytes(int(rng.integers(0, 99)))
     else:
         place = rng.integers(300)
         data[place:place] = rng.bytes(int(rng.integers(1, 9)))
     return bytes(data)
 
 
-def wrong_structure(rng: np.random.Generator, fields: dict[str, Any]) -> bytes:
+def wrong_structure(rng: np.random.Generator, _: dict[str, Any]) -> bytes:
     """Lengths that are not there, levels without end, types that no message has."""
     heads = [b"\xdf", b"\xdd", b"\xc6", b"\xdb", b"\xc9", b"\xde", b"\xdc", b"\xda", b"\xc5"]
     length = struct.pack(">I", int(rng.choice([2**32 - 1, 2**31, 2**20, 20_001, 65_535])))
@@ -146,13 +137,9 @@ def wrong_structure(rng: np.random.Generator, fields: dict[str, Any]) -> bytes:
         b"\x81\xa1a" * deep + b"\xc0",
         msgpack.packb([[0] * 15_000] * int(rng.integers(1, 9))),
         msgpack.packb(msgpack.ExtType(int(rng.integers(0, 127)), rng.bytes(20))),
-        msgpack.packb({1: 2, b"x": fields["time"].tolist()}, strict_types=False),
-        msgpack.packb(rng.choice([0, 1.5, 7]).item()),
-        b"",
-        rng.bytes(int(rng.integers(1, 5000))),
+        rng.bytes(int(rng.integers(0, 5000))),
         b"\0" * (2**20 + 1),
-        wire.pack({**fields, "prompt": "\u0000\u202e" * 400}),
-    ][rng.integers(11)]
+    ][rng.integers(7)]
 
 
 def over_a_socket(rng: np.random.Generator, address: str) -> None:
@@ -165,12 +152,8 @@ def over_a_socket(rng: np.random.Generator, address: str) -> None:
     frames = [
         b"\x82\xff" + struct.pack(">Q", 2**62) + b"abcd",  # a length beyond all bounds
         b"\x82\xfe\xff\xff" + b"abcd" + b"x" * 100,  # never ends
-        b"\x02\x81abcd" + b"x",  # more is to follow, and does not
         b"\x82\x05hello",  # not masked
-        b"\xf2\x81abcdx",  # reserved bits
         b"\x81\x82abcd\xff\xfe",  # a text that is none
-        b"\x89\xff" + struct.pack(">Q", 999) + b"abcd" + b"x" * 999,  # a ping too long
-        b"\x88\x81abcdx",  # a close of one byte
         rng.bytes(200),
     ]
     starts = [hello, hello[:-2], hello.replace(b"GET", b"BREW"), b"\x16\x03\x01" + rng.bytes(99)]
@@ -212,17 +195,11 @@ def over_a_websocket(rng: np.random.Generator, address: str, fields: dict[str, A
 
 
 @pytest.mark.parametrize(
-    "messages", [150, pytest.param(10_000, marks=[pytest.mark.slow, pytest.mark.timeout(3000)])]
+    "messages", [100, pytest.param(10_000, marks=[pytest.mark.slow, pytest.mark.timeout(3000)])]
 )
-def test_broken_messages(
-    messages: int,
-    running: Running,
-    observe: Callable[..., dict[str, Any]],
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_broken_messages(messages: int, running, observe) -> None:
     short = {"sensor": np.zeros((2, 1026), np.float32), "sensor_time": np.array([0.01, 0.02])}
-    fields, refused, began = observe(0, **short), 0, monotonic()
-    warm, served = messages // 10, 0
+    fields, refused, warm = observe(0, **short), 0, messages // 10
     with PolicyClient(f"ws://{running.address}", timeout_s=20) as good:
         before = (0.0, 0)
         for number in range(messages):
@@ -235,17 +212,10 @@ def test_broken_messages(
             if number % 10 == 0:
                 answer = good.infer(observe(number // 10))
                 assert answer["actions"].shape == (4, 7)
-                served += 1
             if number == warm:
                 before = running.held()
         after = running.held()
         good.infer(observe(messages))
-    with capsys.disabled():
-        print(
-            f"\n{messages} messages, {refused} refused, {served} good ones between them, in "
-            f"{monotonic() - began:.0f} s: memory {before[0]:.1f} -> {after[0]:.1f} MB, files "
-            f"{before[1]} -> {after[1]}"
-        )
     assert refused > 0.7 * messages
     assert after[0] < before[0] + GROWTH_MB
     assert after[1] <= before[1] + 8  # strangers that just left

@@ -48,9 +48,8 @@ def test_a_message_is_byte_for_byte_that_of_openpi_client() -> None:
 
 @pytest.mark.parametrize(
     "value",
-    [np.array([None]), np.array(["a"]), np.zeros(2, complex), np.zeros(2, [("a", "f4")]),
-     np.array(["2020"], "M8[D]"), np.complex64(1), {1, 2}, 2**70, np.longdouble(1)],
-)  # fmt: skip
+    [np.array([None]), np.zeros(2, complex), np.zeros(2, [("a", "f4")]), {1, 2}, 2**70],
+)
 def test_what_is_no_plain_number_is_not_sent(value: Any) -> None:
     with pytest.raises(WireError, match="cannot be sent"):
         wire.pack({"a": value})
@@ -73,11 +72,8 @@ def number_of(dtype: Any, value: Any) -> bytes:
     ("data", "said"),
     [
         (b"", "expected a message in msgpack"),
-        (b"\xc0\xc0", "extra data"),
         (msgpack.packb({"a": 1})[:-1], "incomplete"),
-        (b"\xdf\xff\xff\xff\xff", "expected a message in msgpack"),
         (b"\xd6\xff\0\0\0\0", "expected a message in msgpack"),
-        (b"\x81\x01\x01", "expected a message in msgpack"),
         (b"\x91" * 100_000 + b"\xc0", "expected a message in msgpack"),
         (b"\x91" * 13 + b"\xc0", "at most 12 levels"),
         (msgpack.packb([[0] * 9999] * 3), "at most 20000 entries"),
@@ -87,9 +83,7 @@ def number_of(dtype: Any, value: Any) -> bytes:
         (array_of(b"<f4", [1], b"0" * 4), "plain numbers"),
         (array_of("<f4", [2], b"0" * 4), "expected 8 bytes"),
         (array_of("<f4", [2**62, 4], b""), "expected 73786976294838206464 bytes"),
-        (array_of("<f4", [0, 2**62, 2**62], b""), "expected a message in msgpack"),
         (array_of("<f4", [-1], b""), "shape of an array"),
-        (array_of("<f4", [True], b"0" * 4), "shape of an array"),
         (array_of("<f4", [1] * 9, b"0" * 4), "shape of an array"),
         (array_of("<f4", [1], "0000"), "expected 4 bytes for an array of float32, found str"),
         (number_of("<i2", 70_000), "expected a message in msgpack"),

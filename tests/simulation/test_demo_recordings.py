@@ -49,7 +49,7 @@ def contents(root: Path) -> dict[str, bytes]:
 
 
 @pytest.mark.parametrize("name", SETS)
-def test_a_set_reads_back_as_what_was_simulated(demo_root: Path, name: str) -> None:
+def test_a_set_reads_back_as_what_was_simulated(demo_root, name: str) -> None:
     found = recordings(demo_root, name)
     assert len(found) == EPISODES
     for recording, truth in zip(found, simulated(name), strict=True):
@@ -71,7 +71,7 @@ def test_a_set_reads_back_as_what_was_simulated(demo_root: Path, name: str) -> N
 
 
 @pytest.mark.parametrize("name", SETS)
-def test_frames_show_the_scene_at_their_time(demo_root: Path, name: str) -> None:
+def test_frames_show_the_scene_at_their_time(demo_root, name: str) -> None:
     recording, truth = recordings(demo_root, name)[0], simulated(name)[0]
     cameras = recording.cameras()
     assert tuple(cameras) == VIEWS
@@ -85,10 +85,10 @@ def test_frames_show_the_scene_at_their_time(demo_root: Path, name: str) -> None
             assert np.abs(frame.astype(int) - render(view, scene).astype(int)).mean() < 4
 
 
-def test_all_formats_are_one_embodiment(demo_root: Path) -> None:
+def test_all_formats_are_one_embodiment_whose_actions_lead_from_pose_to_pose(demo_root) -> None:
     channels = set()
     for name in SETS:
-        for recording in recordings(demo_root, name):
+        for recording, truth in zip(recordings(demo_root, name), simulated(name), strict=True):
             state, sensor, action = recording.state(), recording.sensor(), recording.action()
             assert state is not None and sensor is not None
             channels.add((state.channels, sensor.channels))
@@ -96,23 +96,15 @@ def test_all_formats_are_one_embodiment(demo_root: Path) -> None:
                 assert action is None and recording.poses() is not None
             else:
                 assert action is not None and action.kind == "delta"
-                assert np.abs(action.values[:, :6]).max() < 3
                 assert (action.values[:, 6] == 1).all()
+                origin = truth.epoch_s + 0.1 if name == "lerobot" else 0.0
+                steps = np.diff(truth.poses(action.time + origin), axis=0)
+                steps = (steps + 180) % 360 - 180
+                np.testing.assert_allclose(action.values[:-1, :6], steps, atol=2e-3)
     assert len(channels) == 1
 
 
-def test_recorded_actions_lead_from_pose_to_pose(demo_root: Path) -> None:
-    for name in ("old", "lerobot"):
-        for recording, truth in zip(recordings(demo_root, name), simulated(name), strict=True):
-            action = recording.action()
-            assert action is not None
-            origin = truth.epoch_s + 0.1 if name == "lerobot" else 0.0
-            poses = truth.poses(action.time + origin)
-            steps = (np.diff(poses, axis=0) + 180) % 360 - 180
-            np.testing.assert_allclose(action.values[:-1, :6], steps, atol=2e-3)
-
-
-def test_windows_come_in_both_kinds_and_robot_clocks_too(demo_root: Path) -> None:
+def test_windows_come_in_both_kinds_and_robot_clocks_too(demo_root) -> None:
     shapes, clocks = [], []
     for folder in sorted((demo_root / "new").glob("*/*")):
         with np.load(folder / "sensor_data.npz") as members:
@@ -124,7 +116,7 @@ def test_windows_come_in_both_kinds_and_robot_clocks_too(demo_root: Path) -> Non
     assert clocks == [False, False, True]
 
 
-def test_clocks_start_apart_and_jitter(demo_root: Path) -> None:
+def test_clocks_start_apart_and_jitter_and_one_episode_crosses_180(demo_root) -> None:
     recording = recordings(demo_root, "raw")[0]
     state, sensor = recording.state(), recording.sensor()
     assert state is not None and sensor is not None
@@ -133,19 +125,13 @@ def test_clocks_start_apart_and_jitter(demo_root: Path) -> None:
     for clock in clocks:
         assert np.diff(clock).std() > 1e-5
     assert np.diff(state.time).max() > 0.04
-
-
-def test_one_episode_crosses_180(demo_root: Path) -> None:
     for name in SETS:
-        jumps = []
-        for recording in recordings(demo_root, name):
-            state = recording.state()
-            assert state is not None
-            jumps.append(bool(np.abs(np.diff(state.values[:, 11])).max() > 300))
+        states = [recording.state() for recording in recordings(demo_root, name)]
+        jumps = [s is not None and np.abs(np.diff(s.values[:, 11])).max() > 300 for s in states]
         assert jumps == [False, False, True]
 
 
-def test_same_seed_same_bytes(demo_root: Path, tmp_path: Path) -> None:
+def test_same_seed_same_bytes(demo_root, tmp_path) -> None:
     """An episode is the same whatever the number of episodes; only what counts them is not."""
     write_demo_recordings(tmp_path / "again", 1, SEED)
     again, before = contents(tmp_path / "again"), contents(demo_root)
@@ -170,33 +156,22 @@ def quick_sets(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     return written
 
 
-def test_finished_sets_are_kept(quick_sets: list[str], tmp_path: Path) -> None:
-    write_demo_recordings(tmp_path, 2, 0)
-    write_demo_recordings(tmp_path, 2, 0)
-    assert sorted(quick_sets) == sorted(SETS)
-
-
-def test_other_params_replace_the_demos_own_sets(quick_sets: list[str], tmp_path: Path) -> None:
-    write_demo_recordings(tmp_path, 2, 0)
-    (tmp_path / "mine").mkdir()
-    write_demo_recordings(tmp_path, 2, 1)
-    assert sorted(quick_sets) == sorted([*SETS, *SETS])
-    assert (tmp_path / "mine").is_dir()
-
-
-def test_a_set_with_an_episode_of_the_users_is_left_alone(
+def test_finished_sets_are_kept_and_other_params_replace_the_demos_own(
     quick_sets: list[str], tmp_path: Path
 ) -> None:
     write_demo_recordings(tmp_path, 2, 0)
-    (tmp_path / "raw/mine").touch()
+    write_demo_recordings(tmp_path, 2, 0)
+    assert sorted(quick_sets) == sorted(SETS)
+    (tmp_path / "mine").mkdir()
+    write_demo_recordings(tmp_path, 2, 1)
+    assert sorted(quick_sets) == sorted([*SETS, *SETS]) and (tmp_path / "mine").is_dir()
+    (tmp_path / "raw/mine").touch()  # an episode of the user's
     with pytest.raises(ConfigError, match=f"{tmp_path / 'raw'}: expected the files that the demo"):
-        write_demo_recordings(tmp_path, 2, 1)
+        write_demo_recordings(tmp_path, 2, 2)
     assert (tmp_path / "raw/mine").exists() and (tmp_path / "new/content").exists()
 
 
-def test_a_stopped_run_goes_on_with_the_unfinished_sets(
-    quick_sets: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_stopped_run_goes_on_with_the_unfinished_sets(quick_sets, tmp_path, monkeypatch) -> None:
     whole = dict(demo_recordings._SETS)
 
     def stopped(folder: Path, episodes: demo_recordings.Episodes) -> None:
@@ -215,13 +190,13 @@ def test_a_stopped_run_goes_on_with_the_unfinished_sets(
     assert not (tmp_path / "old" / "half").exists()
 
 
-def test_a_folder_that_the_demo_did_not_write_is_left_alone(
-    quick_sets: list[str], tmp_path: Path
-) -> None:
-    (tmp_path / "raw").mkdir()
+def test_a_folder_that_the_demo_did_not_write_is_left_alone(quick_sets, tmp_path) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(ConfigError, match=r"did not write it.*demo\.recordings"):
+        write_demo_recordings(tmp_path / "file", 2, 0)
     with pytest.raises(ConfigError, match=r"did not write it.*demo\.recordings"):
         write_demo_recordings(tmp_path, 2, 0)
-    (tmp_path / "raw").rmdir()
+    (tmp_path / "file").unlink()
     write_demo_recordings(tmp_path, 2, 0)
     marker = json.loads((tmp_path / MARKER).read_text(encoding="utf-8"))
     marker["sets"].remove("new")
@@ -231,25 +206,14 @@ def test_a_folder_that_the_demo_did_not_write_is_left_alone(
     assert (tmp_path / "raw" / "content").is_file()
 
 
-@pytest.mark.parametrize(
-    "text",
-    ["{", '{"sets": ["../raw"]}'],
-)
-def test_a_broken_marker_is_named(quick_sets: list[str], tmp_path: Path, text: str) -> None:
+@pytest.mark.parametrize("text", ["{", '{"sets": ["../raw"]}'])
+def test_a_broken_marker_is_named(quick_sets, tmp_path: Path, text: str) -> None:
     (tmp_path / MARKER).write_text(text, encoding="utf-8")
     with pytest.raises(ConfigError, match=rf"{MARKER}: .* Remove the folder"):
         write_demo_recordings(tmp_path, 2, 0)
 
 
-def test_a_file_in_place_of_the_folder_is_named(tmp_path: Path) -> None:
-    (tmp_path / "file").touch()
-    with pytest.raises(ConfigError, match="did not write it"):
-        write_demo_recordings(tmp_path / "file", 2, 0)
-
-
-def test_a_full_disk_says_so(
-    quick_sets: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_full_disk_says_so(quick_sets, tmp_path, monkeypatch) -> None:
     def full(folder: Path, episodes: demo_recordings.Episodes) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
 

@@ -1,6 +1,10 @@
-"""The gymnasium environment: its contract, its clocks, its frames."""
+"""The gymnasium environment: its contract, its clocks, its frames; and as a robot in real time."""
 
+import time
 import warnings
+from collections.abc import Iterator
+from contextlib import closing
+from queue import SimpleQueue
 from typing import Any
 
 import numpy as np
@@ -8,8 +12,8 @@ import pytest
 from gymnasium.error import ResetNeeded
 from gymnasium.utils.env_checker import check_env
 
-from pipeline.simulation.environment import InsertionEnvironment
-from pipeline.simulation.insertion import MAX_TICKS, TICK_S
+from pipeline.simulation.environment import InsertionEnvironment, SimulatedRobot
+from pipeline.simulation.insertion import INSERTED, MAX_TICKS, TICK_S, TIME_IS_UP
 from pipeline.simulation.rendering import VIEWS, photograph, render
 
 STILL = np.zeros(7, np.float32)
@@ -58,11 +62,11 @@ def test_frames_are_those_taken_last() -> None:
         now = float(observation["time"][0])
         assert observation["sensor_time"][-1] == pytest.approx(now)
         assert observation["state_time"][-1] == pytest.approx(now)
-        ages += [now - time for time in info["frame_time"].values()]
-        for view, (time, frame) in environment.frames().items():
+        ages += [now - taken_s for taken_s in info["frame_time"].values()]
+        for view, (taken_s, frame) in environment.frames().items():
             np.testing.assert_array_equal(frame, observation[f"images/{view}"])
-            assert time == info["frame_time"][view]
-            scene = environment.insertion.scene(time)
+            assert taken_s == info["frame_time"][view]
+            scene = environment.insertion.scene(taken_s)
             assert np.abs(frame.astype(int) - render(view, scene).astype(int)).mean() < 4
         observation, *_, info = environment.step(environment.insertion.expert_action())
     assert min(ages) >= 0 and max(ages) < 1.3 * TICK_S and np.std(ages) > 0.01
@@ -80,20 +84,15 @@ def test_a_photograph_has_noise_and_is_the_same_again() -> None:
         assert 1 < np.std(first.astype(int) - clean.astype(int)) < 3
 
 
-def test_seeds_differ_and_none_draws_one() -> None:
-    environment = InsertionEnvironment(cameras=False)
-    first = environment.reset(seed=1)[0]["state"]
-    assert not np.array_equal(first, environment.reset(seed=2)[0]["state"])
-    drawn = environment.reset()[0]["state"]
-    assert not np.array_equal(drawn, environment.reset()[0]["state"])
-
-
 def test_what_makes_no_sense_is_refused() -> None:
     wrong: Any = "hard"
     with pytest.raises(ValueError, match="depth, full, moved, found 'hard'"):
         InsertionEnvironment(wrong)
     with pytest.raises(ValueError, match="found 'hard'"):
         InsertionEnvironment(action_rotation=wrong)
+    environment = InsertionEnvironment(cameras=False)
+    drawn = [environment.reset(seed=seed)[0]["state"] for seed in (1, 2, None, None)]
+    assert len({state.tobytes() for state in drawn}) == 4, "None draws a seed"
     environment = InsertionEnvironment(cameras=False)
     with pytest.raises(ResetNeeded):
         environment.step(STILL)
@@ -103,3 +102,100 @@ def test_what_makes_no_sense_is_refused() -> None:
         environment.step(environment.insertion.expert_action())
     with pytest.raises(ResetNeeded):
         environment.step(STILL)
+
+
+class Clock:
+    """Stands until it is set."""
+
+    now_s = 1000.0
+
+    def __call__(self) -> float:
+        return self.now_s
+
+
+@pytest.fixture
+def clock() -> Clock:
+    return Clock()
+
+
+@pytest.fixture(params=[10.0, 50.0])
+def robot(request: pytest.FixtureRequest, clock: Clock) -> Iterator[SimulatedRobot]:
+    with closing(SimulatedRobot(hz=request.param, seed=3, clock=clock)) as made:
+        yield made
+
+
+def test_an_action_is_a_tick_and_tells_the_readings_of_the_simulation(
+    robot: SimulatedRobot, clock: Clock
+) -> None:
+    environment = InsertionEnvironment(cameras=False)
+    readings, _ = environment.reset(seed=3)
+    for tick in range(3):
+        # A tick begins a little early or late; which it is changes nothing.
+        clock.now_s = 1000.0 + (tick + (0.0, -0.04, 0.9)[tick]) / robot._hz
+        observed = robot.observe()
+        assert observed["time"][0] == pytest.approx(tick / robot._hz)
+        np.testing.assert_array_equal(observed["state"], readings["state"])
+        np.testing.assert_array_equal(observed["sensor"], readings["sensor"])
+        assert observed["state_time"][-1] == pytest.approx(observed["time"][0])
+        # Ten readings a tick, whatever a tick takes.
+        assert np.diff(observed["state_time"]) == pytest.approx(0.1 / robot._hz)
+        action = np.array([0.1 * tick, 0, -0.1, 0, 0, 0, 1])
+        robot.act(action)
+        readings, *_ = environment.step(action)
+
+
+@pytest.mark.parametrize(("waited", "ticks"), [(0.9, 0), (1.96, 2), (2.2, 2)])
+def test_ticks_without_an_action_pass_all_the_same(
+    robot: SimulatedRobot, clock: Clock, waited: float, ticks: int
+) -> None:
+    first = robot.observe()
+    clock.now_s += waited / robot._hz
+    later = robot.observe()
+    assert later["time"] - first["time"] == pytest.approx(ticks / robot._hz)
+    assert len(later.get("state", ())) == 10 * ticks
+
+
+def test_frames_follow_and_say_when_they_were_taken(robot: SimulatedRobot) -> None:
+    first, taken, began = robot.frames(), robot._taken, SimpleQueue[None]()
+    robot._taken = lambda: (began.put(None), taken())[1]
+    robot.observe()
+    for _ in range(2):  # once the second look begins, the first is there
+        robot.act(STILL)
+        began.get(timeout=60)
+    newest, now = robot.frames(), robot.observe()["time"][0]
+    assert set(first) == set(newest) == set(VIEWS)
+    for view, (taken_s, _) in newest.items():
+        assert first[view][0] <= taken_s <= now + 1e-9
+    assert any(newest[view][0] > first[view][0] for view in VIEWS)
+
+
+def test_the_end_of_an_episode_ends_the_run(robot: SimulatedRobot) -> None:
+    robot.observe()
+    while not robot._environment.insertion.finished:
+        robot.act(robot._environment.insertion.expert_action())
+    robot.act(STILL)
+    assert robot.observe()["ended"] == robot.outcome == INSERTED
+
+
+def test_an_episode_that_ends_while_nobody_acts_ends_the_run_too(clock: Clock) -> None:
+    with closing(SimulatedRobot(hz=1000.0, seed=3, clock=clock)) as robot:
+        robot.observe()
+        clock.now_s += 0.13  # all its 120 ticks
+        assert robot.observe()["ended"] == robot.outcome == f"{TIME_IS_UP} before a puncture"
+
+
+def test_its_clock_is_the_monotonic_one() -> None:
+    with closing(SimulatedRobot(hz=1000.0, seed=3)) as robot:
+        robot.observe()
+        began_s = time.monotonic()
+        while robot.observe()["time"] < 0.02:
+            pass
+        assert time.monotonic() - began_s > 0.018
+
+
+def test_a_robot_that_was_stopped_does_not_move(robot: SimulatedRobot) -> None:
+    robot.observe()
+    robot.stop("by hand")
+    robot.act(np.array([1.0, 0, 0, 0, 0, 0, 1]))
+    assert robot.stopped == "by hand" and robot.outcome is None
+    assert robot._environment.insertion.time_s == pytest.approx(0.1)

@@ -14,12 +14,14 @@ from pipeline.simulation.expert import NOT_ALIGNED_MM, REACTION_TICKS, Percept, 
 from pipeline.simulation.insertion import (
     AT_LAYER_MM,
     FORCE_LIMIT_N,
+    HOLD_TICKS,
     INSERTED,
     MAX_TICKS,
     MISS_MM,
     OVERSHOOT_MM,
     TICK_S,
     NeedleInsertion,
+    Progress,
 )
 from pipeline.simulation.layout import WORKSPACE_MM, InsertionLayout, draw_layout
 from pipeline.simulation.needle_sensor import BIN_MM
@@ -57,19 +59,12 @@ def test_same_seed_and_actions_give_the_same_bits() -> None:
     for insertion in insertions:
         insertion.reset(3)
     for first, second in zip(*map(follow, insertions), strict=True):
+        second.expert_action()  # asking changes nothing
         np.testing.assert_array_equal(first.sensor, second.sensor)
         np.testing.assert_array_equal(first.state, second.state)
         assert first.time_s == second.time_s
     views = [photograph("View2", insertion, 1.0) for insertion in insertions]
     np.testing.assert_array_equal(*views)
-
-
-def test_observing_again_changes_nothing() -> None:
-    insertion = NeedleInsertion()
-    insertion.reset(1)
-    first, action = insertion.sensor.copy(), insertion.expert_action()
-    np.testing.assert_array_equal(insertion.sensor, first)
-    np.testing.assert_array_equal(insertion.expert_action(), action)
 
 
 def test_a_scan_peaks_at_the_tip_to_tissue_distance() -> None:
@@ -103,15 +98,6 @@ def test_the_layer_is_the_second_peak_until_it_is_the_only_one() -> None:
     assert abs(inside.argmax() * BIN_MM - insertion.contact.layer_mm[-1]) < 0.05
 
 
-def test_beyond_the_range_nothing_is_seen() -> None:
-    layout = calm()
-    start = layout.start_pose.copy()
-    start[2] = layout.surfaces_mm[0] + 8.0
-    insertion = NeedleInsertion()
-    insertion.start(replace(layout, start_pose=start))
-    assert np.ptp(insertion.sensor[-1, 1:]) <= 4
-
-
 def test_force_rises_on_contact_drops_at_puncture_and_grows_with_depth() -> None:
     insertion = NeedleInsertion()
     insertion.start(calm())
@@ -136,20 +122,6 @@ def test_force_rises_on_contact_drops_at_puncture_and_grows_with_depth() -> None
     assert (np.diff(i.astype(int)) >= 0).all()
 
 
-def test_a_needle_pulled_out_must_puncture_again() -> None:
-    insertion = NeedleInsertion()
-    insertion.start(calm())
-    while not insertion.inside:
-        insertion.step(down(0.2))
-    while insertion.inside:
-        insertion.step(down(-0.2))
-    assert insertion.contact.force_n[-1] == 0
-    while insertion.contact.distance_mm[-1] > 0:
-        insertion.step(down(0.2))
-    insertion.step(down(0.05))
-    assert not insertion.inside and insertion.contact.force_n[-1] > 0
-
-
 def twins(
     first: InsertionLayout, second: InsertionLayout
 ) -> Iterator[tuple[NeedleInsertion, NeedleInsertion]]:
@@ -165,7 +137,7 @@ def twins(
         yield one, other
 
 
-@pytest.mark.parametrize("seed", [0, 4, 11])
+@pytest.mark.parametrize("seed", [0, 11])
 def test_depth_does_not_show_in_images_or_state(seed: int) -> None:
     layout = draw_layout(seed)
     deeper = replace(
@@ -188,7 +160,7 @@ def test_depth_does_not_show_in_images_or_state(seed: int) -> None:
     assert sensed and tick > 5
 
 
-@pytest.mark.parametrize("seed", [0, 4, 11])
+@pytest.mark.parametrize("seed", [0, 11])
 def test_lateral_target_does_not_show_in_sensor_or_state(seed: int) -> None:
     layout = draw_layout(seed)
     mirrored = replace(layout, targets_mm=-layout.targets_mm)
@@ -213,7 +185,7 @@ def test_start_and_target_say_nothing_of_each_other() -> None:
 
 
 @pytest.mark.parametrize("level", ["depth", "full", "moved"])
-@pytest.mark.parametrize("seed", range(300, 304))
+@pytest.mark.parametrize("seed", range(300, 302))
 def test_the_demonstrator_succeeds(seed: int, level: Level) -> None:
     insertion = NeedleInsertion()
     insertion.reset(seed, level)
@@ -264,11 +236,10 @@ def test_the_demonstrator_reacts_to_a_push_only_after_its_reaction_time() -> Non
     assert differs.index(True) + 1 - moved.index(True) == REACTION_TICKS
 
 
-@pytest.mark.parametrize("seed", [1, 2])
-def test_both_rotation_conventions_lead_to_the_same_episode(seed: int) -> None:
+def test_both_rotation_conventions_lead_to_the_same_episode() -> None:
     by_vector, by_angles = NeedleInsertion("rotvec"), NeedleInsertion("euler_delta")
-    by_vector.reset(seed)
-    by_angles.reset(seed)
+    by_vector.reset(1)
+    by_angles.reset(1)
     for _ in range(15):
         by_vector.step(by_vector.expert_action())
         before, action = by_angles.setpoint, by_angles.expert_action()
@@ -376,37 +347,35 @@ def test_a_needle_inside_is_held_sideways() -> None:
     assert insertion.contact.force_n[-1] > straight + 0.02
 
 
-def test_a_layer_that_was_passed_is_no_success() -> None:
-    insertion = NeedleInsertion()
-    insertion.reset(3, "full")
-    for _ in follow(insertion):
-        pass
-    progress = insertion.progress
-    assert insertion.outcome == INSERTED
-    assert replace(progress, overshoot_mm=1.1 * OVERSHOOT_MM).outcome(50) == "beyond the layer"
-    beside = replace(progress, puncture_mm=np.array([1.1, 0.0]))
+def test_a_limit_that_was_passed_is_no_success() -> None:
+    good = Progress(np.zeros(2), 0.9 * OVERSHOOT_MM, 0.9 * FORCE_LIMIT_N, HOLD_TICKS)
+    assert good.outcome(50) == INSERTED
+    assert replace(good, held_ticks=HOLD_TICKS - 1).outcome(50) is None
+    assert replace(good, overshoot_mm=1.1 * OVERSHOOT_MM).outcome(50) == "beyond the layer"
+    beside = replace(good, puncture_mm=np.array([1.1 * MISS_MM, 0.0]))
     assert beside.outcome(50) == "punctured beside the target"
-    assert replace(progress, max_force_n=2.6).outcome(50) == "too much force"
+    assert replace(good, max_force_n=1.1 * FORCE_LIMIT_N).outcome(50) == "too much force"
 
 
-def test_every_puncture_is_judged() -> None:
+def test_a_needle_pulled_out_must_puncture_again_and_every_puncture_is_judged() -> None:
     insertion = over_the_target()
     while not insertion.inside:
         insertion.step(down(0.15))
     while insertion.inside:
         insertion.step(down(-0.3))
+    assert insertion.contact.force_n[-1] == 0
     for _ in range(6):
         insertion.step(np.array([0.3, 0, 0.05, 0, 0, 0, 1.0]))
-    assert not insertion.finished
+    while insertion.contact.distance_mm[-1] > 0:
+        insertion.step(down(0.15))
+    assert not insertion.inside and insertion.contact.force_n[-1] > 0
     assert plunge(insertion, (40, down(0.15))) == "punctured beside the target"
 
 
-@pytest.mark.parametrize("action", [np.full(7, np.nan), np.zeros(6), np.full(7, np.inf)])
+@pytest.mark.parametrize("action", [np.full(7, np.nan), np.zeros(6)])
 def test_an_action_that_is_none_is_refused(action: NDArray[np.float64]) -> None:
-    insertion = NeedleInsertion()
-    insertion.reset(1)
     with pytest.raises(ValueError, match="7 finite numbers"):
-        insertion.step(action)
+        over_the_target().step(action)
 
 
 def test_levels() -> None:
@@ -435,12 +404,12 @@ def percept(miss_mm: float, distance_mm: float) -> Percept:
     )
 
 
-@pytest.mark.parametrize("distance", [0.0, 0.2, 0.7, 1.3, 2.0, 4.0])
+@pytest.mark.parametrize("distance", [0.0, 0.7, 1.3, 4.0])
 def test_the_demonstrator_never_returns_upwards_and_waits_where_it_is(distance: float) -> None:
     """Averages of what it does at two misses stand between them: nobody learns to hover."""
 
     def falls(miss: float) -> float:
-        seeds = (np.random.default_rng(seed) for seed in range(200))
+        seeds = (np.random.default_rng(seed) for seed in range(100))
         motions = [expert_motion(percept(miss, distance), 8.0, TICK_S, rng)[2] for rng in seeds]
         return -float(np.mean(motions))
 
@@ -450,8 +419,8 @@ def test_the_demonstrator_never_returns_upwards_and_waits_where_it_is(distance: 
     assert max(-np.diff(speeds)) < 0.025  # no step of its gate
 
 
-@pytest.mark.parametrize("seed", range(4))
-def test_who_averages_the_demonstrator_arrives(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("seed", range(2))
+def test_who_averages_the_demonstrator_arrives(seed: int, monkeypatch) -> None:
     """An imitator that sees the target with an error of 0.45 mm an axis, anew every third tick.
 
     It does the mean of what the demonstrator would at the places where the target may be. Imitating

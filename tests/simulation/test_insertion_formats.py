@@ -21,7 +21,7 @@ def lines(path: Path) -> list[dict[str, Any]]:
     return [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
 
 
-def test_meta_agrees_with_the_files(root: Path) -> None:
+def test_meta_agrees_with_the_files(root) -> None:
     info = json.loads((root / "meta" / "info.json").read_text(encoding="utf-8"))
     episodes = lines(root / "meta" / "episodes.jsonl")
     first = 0
@@ -43,7 +43,7 @@ def test_meta_agrees_with_the_files(root: Path) -> None:
 
 
 @pytest.mark.parametrize("view", VIEWS)
-def test_every_frame_decodes(root: Path, view: str) -> None:
+def test_every_frame_decodes(root, view: str) -> None:
     info = json.loads((root / "meta" / "info.json").read_text(encoding="utf-8"))
     key = f"observation.images.{view}"
     for episode in lines(root / "meta" / "episodes.jsonl"):
@@ -57,7 +57,7 @@ def test_every_frame_decodes(root: Path, view: str) -> None:
         assert codec == info["features"][key]["info"]["video.codec"]
 
 
-def test_statistics_are_those_of_the_rows(root: Path) -> None:
+def test_statistics_are_those_of_the_rows(root) -> None:
     for row in lines(root / "meta" / "episodes_stats.jsonl"):
         name = f"episode_{row['episode_index']:06d}.parquet"
         table = pq.read_table(root / "data" / "chunk-000" / name)

@@ -1,15 +1,13 @@
 """Windows of the newest readings, and what a policy is given of them."""
 
-from collections.abc import Callable
 from dataclasses import asdict
-from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.robot.robot_memory import ReadingWindow, RobotMemory, SeenFeatures
+from pipeline.robot.readings import ReadingWindow, RobotMemory, SeenFeatures
 from pipeline.store import FeatureStore
 from pipeline.train.batches import Windows
 
@@ -44,14 +42,6 @@ def test_what_is_older_than_the_window_is_no_reading_of_it() -> None:
     assert window.at(9.0)[1] == 0  # the stream has stalled
 
 
-def test_a_stream_that_the_policy_has_not_is_passed_over() -> None:
-    memory = RobotMemory({"state": ReadingWindow(2, 1, None)})
-    readings = {"sensor": np.ones((2, 1026), np.float32), "state": np.ones((2, 1), np.float32)}
-    readings |= {"sensor_time": np.zeros(2), "state_time": np.zeros(2)}
-    memory.sense({"time": np.array([0.1]), **readings})
-    assert memory.observation().keys() == {"state", "state_valid", "state_age"}
-
-
 def sensed(time_s: float, **streams: np.ndarray) -> dict[str, np.ndarray]:
     """What came by now, all of it just now."""
     times = {f"{name}_time": np.full(len(values), time_s) for name, values in streams.items()}
@@ -60,7 +50,8 @@ def sensed(time_s: float, **streams: np.ndarray) -> dict[str, np.ndarray]:
 
 def test_an_observation_is_a_copy_with_the_true_ages() -> None:
     memory = RobotMemory({"sensor": ReadingWindow(3, 2, None), "state": ReadingWindow(2, 1, None)})
-    memory.sense(sensed(0.1, sensor=np.ones((2, 2), np.float32)))
+    unknown = np.ones((2, 3), np.float32)  # a stream that the policy does not have
+    memory.sense(sensed(0.1, sensor=np.ones((2, 2), np.float32), lidar=unknown))
     first = memory.observation()
     streams = ("sensor", "state")
     assert first.keys() == {f"{name}{what}" for name in streams for what in ("", "_valid", "_age")}
@@ -79,7 +70,7 @@ def test_an_observation_is_a_copy_with_the_true_ages() -> None:
 
 @pytest.mark.parametrize("oldest_s", [None, 0.03, 0.05, 0.5])
 def test_a_robot_sees_what_training_sees_of_the_same_readings(
-    tiny_store: Callable[..., Path], tmp_path: Path, oldest_s: float | None
+    tiny_store, tmp_path, oldest_s: float | None
 ) -> None:
     """At every tick of an episode that is felt reading by reading; a window is as old as a whole
     number of readings, but for rounding."""
