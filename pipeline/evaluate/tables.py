@@ -14,7 +14,7 @@ from pipeline.base.files import write_document
 from pipeline.base.table import Table
 from pipeline.evaluate.ablation import AblationStudy
 from pipeline.evaluate.baselines import METHODS
-from pipeline.evaluate.evaluation import Evaluation
+from pipeline.evaluate.evaluation import BEST, ENERGY, MEAN, PHASE_RULE, PHASES, Evaluation
 from pipeline.evaluate.figures import (
     FEWEST_GROUPS,
     NO_INTERVAL,
@@ -28,8 +28,6 @@ from pipeline.evaluate.figures import (
     sums_by_group,
     with_unit,
 )
-from pipeline.evaluate.phases import PHASE_RULE, PHASES
-from pipeline.evaluate.samples import BEST, ENERGY, MEAN
 from pipeline.store import FeatureStore
 from pipeline.train.predictions import Predictions
 from pipeline.train.scores import ActionGroup, Comparison

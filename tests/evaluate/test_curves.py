@@ -4,8 +4,8 @@ from pathlib import Path
 from types import SimpleNamespace
 
 from pipeline.base.config import TrainHeadParams
-from pipeline.evaluate.curves import TrainingCurves
-from pipeline.evaluate.curves import read_curves as curves_of
+from pipeline.evaluate.sources import TrainingCurves
+from pipeline.evaluate.sources import read_curves as curves_of
 
 
 def read_curves(logs: Path, step: int = 20, **metrics: float) -> TrainingCurves:

@@ -12,7 +12,7 @@ from pipeline.base.config import Source
 from pipeline.base.digests import file_digest
 from pipeline.data import Recording, content_digest, open_recordings
 from pipeline.data.timeline import Timeline, build_timeline
-from pipeline.evaluate.episode_frames import EpisodeFrames, read_episode_frames, shown_ticks
+from pipeline.evaluate.sources import EpisodeFrames, read_episode_frames, shown_ticks
 from pipeline.simulation.insertion_formats import (
     ABUTTING,
     write_lerobot,

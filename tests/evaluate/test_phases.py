@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.evaluate.phases import phases_of
+from pipeline.evaluate.evaluation import phases_of
 from pipeline.store import FeatureStore
 
 TICKS = np.arange(30, 60)

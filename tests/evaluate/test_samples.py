@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pipeline.evaluate.samples import BEST, MEAN, SampledChunks
+from pipeline.evaluate.evaluation import BEST, MEAN, SampledChunks
 
 CHUNKS = np.array([[[[0.0, 9.0], [0.0, 9.0]]], [[[4.0, 9.0], [2.0, 9.0]]]], np.float32)
 """Two samples of one tick, two steps, two dimensions of which the second never varies."""

@@ -13,10 +13,9 @@ from pipeline.base.config import EvaluateParams, TrainHeadParams
 from pipeline.base.table import Table
 from pipeline.evaluate.ablation import evaluate_ablation
 from pipeline.evaluate.baselines import Baselines
-from pipeline.evaluate.curves import TrainingCurve, TrainingCurves
-from pipeline.evaluate.episode_frames import EpisodeFrames
 from pipeline.evaluate.evaluation import Evaluation, judged_document
 from pipeline.evaluate.figures import error, rivalry
+from pipeline.evaluate.sources import EpisodeFrames, TrainingCurve, TrainingCurves
 from pipeline.evaluate.tables import HEADINGS, error_table
 from pipeline.look import evaluation as evaluation_page
 from pipeline.look.evaluation import evaluation_report

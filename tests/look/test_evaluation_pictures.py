@@ -13,11 +13,10 @@ from matplotlib.figure import Figure
 
 from pipeline.evaluate.ablation import Ablated, AblationStudy
 from pipeline.evaluate.baselines import BASELINES
-from pipeline.evaluate.curves import TrainingCurve, TrainingCurves
-from pipeline.evaluate.probe.folds import ProbeFolds
 from pipeline.evaluate.probe.inputs import SlotName
-from pipeline.evaluate.probe.ridge import ProbeScore
+from pipeline.evaluate.probe.ridge import ProbeFolds, ProbeScore
 from pipeline.evaluate.probe.study import Known, ProbeResult, ProbeStudy
+from pipeline.evaluate.sources import TrainingCurve, TrainingCurves
 from pipeline.look import evaluation as plots
 from pipeline.look import probe
 from pipeline.look.page.style import write

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from pipeline.base.errors import StoreMismatch
-from pipeline.evaluate.probe.folds import fold_by_recording
+from pipeline.evaluate.probe.ridge import fold_by_recording
 from pipeline.store import FeatureStore
 
 Make = Callable[..., Any]

@@ -8,8 +8,7 @@ import pytest
 
 from pipeline.base.errors import NumericsError
 from pipeline.evaluate.figures import Figure
-from pipeline.evaluate.probe.folds import ProbeFolds
-from pipeline.evaluate.probe.ridge import cross_validate, estimate
+from pipeline.evaluate.probe.ridge import ProbeFolds, cross_validate, estimate
 
 PENALTIES = (1e-3, 1e-1, 1.0, 30.0)
 Rows = tuple[np.ndarray, np.ndarray, ProbeFolds]

@@ -10,9 +10,8 @@ import pytest
 
 from pipeline.base.config import ProbeParams
 from pipeline.base.errors import NumericsError
-from pipeline.evaluate.probe.folds import ProbeFolds
 from pipeline.evaluate.probe.inputs import SlotName
-from pipeline.evaluate.probe.ridge import ProbeScore
+from pipeline.evaluate.probe.ridge import ProbeFolds, ProbeScore
 from pipeline.evaluate.probe.study import (
     Known,
     ProbeResult,
