@@ -11,10 +11,17 @@ from PIL import Image
 
 from pipeline.base.errors import DiskFull
 from pipeline.base.issue import Issue
-from pipeline.look.page.blocks import Issues, Picture, Report, Section, Text
-from pipeline.look.page.issues import group_issues, place_of, places_of
-from pipeline.look.page.style import GRID, INK, canvas
-from pipeline.look.page.svg import inline_svg
+from pipeline.look.page.blocks import (
+    Issues,
+    Picture,
+    Report,
+    Section,
+    Text,
+    group_issues,
+    place_of,
+    places_of,
+)
+from pipeline.look.page.style import GRID, INK, canvas, inline_svg
 from pipeline.look.page.writing import MOST_PLACES, PAGE, write_report
 
 
