@@ -65,8 +65,7 @@ def test_errors_worked_out_by_hand() -> None:
 def test_a_horizon_no_episode_reaches_has_no_error_and_counts_nowhere(
     recorded: Recorded, compared: Compared
 ) -> None:
-    last = recorded(np.array([29, 59]), error=1.0)
-    score = compared(last).scores["policy"]
+    score = compared(recorded(np.array([29, 59]), error=1.0)).scores["policy"]
     assert score.mae == pytest.approx(np.ones(5))
     assert np.isnan(score.mae_horizon[1:]).all()
 
@@ -123,28 +122,22 @@ def test_what_hardly_moves_beside_its_like_is_told_and_can_be_left_out(
 
 
 @pytest.mark.parametrize(
-    "changed",
+    ("changed", "still"),
     [
-        {"units": ("mm", "mm", "mm", "rad", "rad")},
-        {"scale": np.array([0.0, 0.0, 0.0, 1.0, 0.001])},
+        ({}, {3, 4}),
+        ({"names": ("kHip", "kKnee", "kAnkle", "kElbow", "kWrist")}, {3, 4}),
+        ({"units": ("mm", "mm", "mm", "rad", "rad")}, set()),
+        ({"scale": np.array([0.0, 0.0, 0.0, 1.0, 0.001])}, set()),
     ],
 )
-def test_what_has_no_like_is_not_still(
-    recorded: Recorded, compared: Compared, changed: dict[str, Any]
+def test_only_what_has_its_like_may_be_still(
+    recorded: Recorded, compared: Compared, changed: dict[str, Any], still: set[int]
 ) -> None:
+    """Joints that are called after limbs are alike by their unit."""
     comparison = compared(recorded(np.arange(60)))
     assert comparison.low_variance() == {}
-    still = joints(comparison, [1.0, 1.0, 1.0, 0.001, 0.001])
-    assert still.low_variance().keys() == {3, 4}
-    assert replace(still, **changed).low_variance() == {}
-
-
-def test_joints_that_are_called_after_limbs_are_alike_by_their_unit(
-    recorded: Recorded, compared: Compared
-) -> None:
-    still = joints(compared(recorded(np.arange(60))), [1.0, 1.0, 1.0, 1.0, 0.001])
-    names = ("kHip", "kKnee", "kAnkle", "kElbow", "kWrist")
-    assert replace(still, names=names).low_variance().keys() == {4}
+    changed_joints = replace(joints(comparison, [1.0, 1.0, 1.0, 0.001, 0.001]), **changed)
+    assert changed_joints.low_variance().keys() == still
 
 
 class FirstFeature(torch.nn.Module):
