@@ -17,6 +17,7 @@ from pipeline.look.page.blocks import Picture, Text
 from pipeline.look.recording.cameras import camera_blocks, draw_views
 from pipeline.look.recording.clocks import Clock, clock_blocks, clock_table, draw_lanes
 from pipeline.look.recording.episode import EpisodeView
+from pipeline.look.recording.samples import cut_samples, draw_samples, window_lengths
 from pipeline.look.recording.streams import (
     contacts,
     draw_motion,
@@ -28,7 +29,11 @@ from pipeline.look.recording.streams import (
 )
 
 PARAMS = Params.model_validate(
-    {"data": {"sources": [{"name": "s", "path": "."}]}, "vlm": {"checkpoint": "none"}}
+    {
+        "data": {"sources": [{"name": "s", "path": "."}]},
+        "vlm": {"checkpoint": "none"},
+        "inspect": {"samples": 1},
+    }
 )
 Felt = Callable[..., EpisodeView]
 Words = Callable[[Figure], str]
@@ -205,6 +210,7 @@ def test_the_same_recording_is_the_same_bytes(view: EpisodeView) -> None:
         lambda: draw_sensor(view),
         lambda: draw_motion(view),
         lambda: draw_lanes(view),
+        lambda: draw_samples(view, cut_samples(view, PARAMS), window_lengths(PARAMS)),
     )
     for draw in draws:
         assert saved(draw(), "png") == saved(draw(), "png")
