@@ -54,40 +54,50 @@ def test_the_slot_that_carries_the_action_is_first(tiny_store: Make, tmp_path: P
         assert abs(other.alone.mean) < 0.1
 
 
-def test_scores_are_those_of_a_plain_ridge_regression(
-    store: FeatureStore,
-    nested: Callable[..., tuple[np.ndarray, np.ndarray]],
-    limited: Callable[[np.ndarray, np.ndarray], np.ndarray],
-    r2_by_fold: Make,
-) -> None:
-    """Every tick a row of its own, although the store is read a VL row at a time.
+@pytest.fixture
+def plain(nested: Make, limited: Make, r2_by_fold: Make) -> Make:
+    """`plain(study, store, slots, score)`: the score is that of ridge regression on the rows.
 
-    A feature rests but in one recording, and another has a spike: what is read is within limits.
+    Every tick is a row of its own, although the store is read a VL row at a time; where a slot is
+    not valid its mean is read.
     """
+
+    def check(
+        study: ProbeStudy, store: FeatureStore, slots: tuple[int, ...], score: ProbeScore
+    ) -> np.ndarray:
+        ticks, fold = study.folds.ticks, study.folds.fold
+        rows, first, of_tick = np.unique(
+            store.array("tick/vl_row")[ticks], return_index=True, return_inverse=True
+        )
+        columns = []
+        for slot in slots:
+            valid = store.array("vl/slot_valid")[rows, slot] != 0
+            columns.append(np.zeros((len(rows), 8)))
+            raw = store.array("vl/features")[rows[valid], slot].astype(np.float64)
+            columns[-1][valid] = limited(raw, fold[:, first[valid]])
+        x = np.hstack(columns)[of_tick]
+        y = store.array("tick/action").astype(np.float64)[ticks[:, None] + np.arange(2)]
+        y = y.reshape(len(y), -1)
+        varies = y.std(0) > 0
+        for repeat, deal in enumerate(fold):
+            r2, chosen = nested(x, y, deal, PENALTIES)
+            scored = r2_by_fold(score, study.folds, repeat)
+            np.testing.assert_allclose(scored[:, varies], r2[:, varies], atol=1e-8)
+            np.testing.assert_array_equal(score.penalties[repeat], chosen)
+        return x
+
+    return check
+
+
+def test_scores_are_those_of_a_plain_ridge_regression(store: FeatureStore, plain: Make) -> None:
+    """A feature rests but in one recording, and another has a spike."""
     store.array("vl/features")[10:, 0, 2] = 0.5
     store.array("vl/features")[33, 1, 3] = 300
     study = probed(store, folds=3, repeats=2)
-    ticks, fold = study.folds.ticks, study.folds.fold
-    rows, first, row = np.unique(
-        store.array("tick/vl_row")[ticks], return_index=True, return_inverse=True
-    )
-    raw = store.array("vl/features")[rows].astype(np.float64)
-    x = np.stack([limited(raw[:, slot], fold[:, first]) for slot in range(3)], axis=1)[row]
-    assert (x[:, 0, 2] == 0).all()
-    assert np.abs(x[:, 1, 3]).max() < np.abs(raw[:, 1, 3] - raw[:, 1, 3].mean()).max() / 10
-    action = store.array("tick/action").astype(np.float64)
-    y = action[ticks[:, None] + np.arange(2)].reshape(len(ticks), -1)
-    varies = y.std(0) > 0
-    for index, found in enumerate(study.slots):
-        for repeat, deal in enumerate(fold):
-            r2, chosen = nested(x[:, index], y, deal, PENALTIES)
-            scored = r2_by_fold(found.alone, study.folds, repeat)
-            np.testing.assert_allclose(scored[:, varies], r2[:, varies], atol=1e-8)
-            np.testing.assert_array_equal(found.alone.penalties[repeat], chosen)
+    first, second, _ = (plain(study, store, one.slots, one.alone) for one in study.slots)
+    assert (first[:, 2] == 0).all() and np.abs(second[:, 3]).max() < 30
     (group,) = study.groups
-    r2, _ = nested(x.reshape(len(x), -1), y, fold[1], PENALTIES)
-    scored = r2_by_fold(group.alone, study.folds, 1)
-    np.testing.assert_allclose(scored[:, varies], r2[:, varies], atol=1e-8)
+    plain(study, store, (0, 1, 2), group.alone)
     assert (group.channels, group.inputs) == (24, 24)
 
 
@@ -110,33 +120,13 @@ def test_what_only_tells_recordings_apart_does_not_help(tiny_store: Make, tmp_pa
     assert (1 - error / store.array("tick/action")[:, :4].var(0)).min() > 0.9
 
 
-def test_a_slot_stands_at_its_mean_where_it_is_not_valid(
-    store: FeatureStore,
-    nested: Callable[..., tuple[np.ndarray, np.ndarray]],
-    limited: Callable[[np.ndarray, np.ndarray], np.ndarray],
-    r2_by_fold: Make,
-) -> None:
+def test_a_slot_stands_at_its_mean_where_it_is_not_valid(store: FeatureStore, plain: Make) -> None:
     store.array("vl/slot_valid")[12:17, 1] = 0
     store.array("vl/features")[12:17, 1] = np.nan  # what is not valid is not read
     study = probed(store, folds=3, repeats=2)
-    ticks, fold = study.folds.ticks, study.folds.fold
-    rows, first, of_tick = np.unique(
-        store.array("tick/vl_row")[ticks], return_index=True, return_inverse=True
-    )
-    there = ~np.isin(rows, range(12, 17))
-    assert study.slots[0].valid_share == 1
-    assert study.slots[1].valid_share == pytest.approx(there[of_tick].mean())
-    y = store.array("tick/action").astype(np.float64)[ticks[:, None] + np.arange(2)]
-    y = y.reshape(len(y), -1)
-    varies = y.std(0) > 0
-    raw = store.array("vl/features")[rows[there], 1].astype(np.float64)
-    x = np.zeros((len(rows), 8))
-    x[there] = limited(raw, fold[:, first[there]])
-    r2, _ = nested(x[of_tick], y, fold[0], PENALTIES)
-    scored = r2_by_fold(study.slots[1].alone, study.folds)
-    np.testing.assert_allclose(scored[:, varies], r2[:, varies], atol=1e-8)
-    assert "elsewhere its mean is read" in table(study)
-    assert study.groups[0].valid_share == 1
+    there = ~np.isin(store.array("tick/vl_row")[study.folds.ticks], range(12, 17))
+    assert [one.valid_share for one in (*study.slots[:2], *study.groups)] == [1, there.mean(), 1]
+    plain(study, store, (1,), study.slots[1].alone)
 
 
 def test_a_slot_that_is_valid_nowhere_says_nothing(store: FeatureStore) -> None:
@@ -334,8 +324,3 @@ def test_one_strange_recording_is_no_gain() -> None:
     known = by_recording(0.1, 0.1, 0.1, 0.1, -90.0)
     saved = by_recording(0.0, 0.0, 0.0, 0.0, 0.5)
     assert recommend(study_of(known, (1, by_recording(0, 0, 0, 0, 0), saved))) is None
-
-
-def test_features_that_do_not_help_are_said_not_to(store: FeatureStore) -> None:
-    store.array("vl/features")[:] = 0.25
-    assert "does not show that a linear reader gains" in advice(probed(store))
