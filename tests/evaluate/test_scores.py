@@ -2,21 +2,16 @@
 
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.base.errors import NumericsError
 from pipeline.evaluate.baselines import BASELINES
 from pipeline.evaluate.figures import rivalry
-from pipeline.store import FeatureStore
-from pipeline.train.batches import Windows
-from pipeline.train.predictions import Predictions, predict
+from pipeline.train.predictions import Predictions
 from pipeline.train.scores import ActionGroup, Comparison, compare
 
 Recorded = Callable[..., Predictions]
@@ -138,54 +133,6 @@ def test_only_what_has_its_like_may_be_still(
     assert comparison.low_variance() == {}
     changed_joints = replace(joints(comparison, [1.0, 1.0, 1.0, 0.001, 0.001]), **changed)
     assert changed_joints.low_variance().keys() == still
-
-
-class FirstFeature(torch.nn.Module):
-    """Acts by the batch alone, so that what `predict` hands to it shows in what comes out."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.weight = torch.nn.Parameter(torch.ones(1))
-
-    stochastic = False
-
-    def sample(self, batch, samples=1, generator=None):
-        return batch.features[None, :, :1, :1].expand(samples, -1, 4, 5) * self.weight
-
-
-def test_predictions_belong_to_their_ticks(store: FeatureStore) -> None:
-    ticks = np.arange(25, 65)
-    windows = Windows(horizon=4, sensor_window=2, state_window=2)
-    found = predict(FirstFeature(), store, ticks, windows, 7)  # type: ignore[arg-type]
-    rows = store.array("tick/vl_row")[ticks]
-    assert np.array_equal(found.predicted[:, 0, 0], store.array("vl/features")[rows, 0, 0])
-    expected = store.gather(ticks, horizon=4)
-    assert np.array_equal(found.recorded, expected.action.numpy())
-    assert np.array_equal(found.valid, expected.action_valid.numpy())
-    assert found.episodes.tolist() == [0] * 5 + [1] * 30 + [2] * 5
-
-
-WINDOWS = Windows(horizon=4, sensor_window=2, state_window=2)
-
-
-@pytest.mark.parametrize("what", ["recorded action", "action of the policy"])
-def test_a_number_that_is_none_is_named_by_episode_tick_and_time(
-    tiny_store: Callable[..., Path], tmp_path: Path, what: str
-) -> None:
-    store = FeatureStore.open(tiny_store(tmp_path))
-    if what == "recorded action":
-        store.array("tick/action")[37, 3] = np.nan
-    else:
-        store.array("vl/features")[store.array("tick/vl_row")[37], 0, 0] = np.inf
-    with pytest.raises(NumericsError) as caught:
-        predict(FirstFeature(), store, np.arange(30, 60), WINDOWS, 8)  # type: ignore[arg-type]
-    said = str(caught.value)
-    # The VL row of tick 37 serves ticks 36 to 38.
-    place = "tick 7 (at 0.700 s)" if what == "recorded action" else "tick 6 (at 0.600 s)"
-    assert f"right/episode_001, {place}" in said
-    assert what in said
-    # Beyond the end of an episode nothing was recorded, so nothing can be wrong there.
-    assert len(predict(FirstFeature(), store, np.arange(26, 30), WINDOWS, 8).ticks)  # type: ignore[arg-type]
 
 
 def test_the_overall_error_of_episodes_of_one_length_is_their_mean(

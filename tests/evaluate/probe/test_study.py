@@ -112,12 +112,6 @@ def test_what_only_tells_recordings_apart_does_not_help(tiny_store: Make, tmp_pa
     store.array("tick/action")[:, :4] = action[episode] + 0.01 * rng.normal(size=(600, 4))
     found = probed(store).slots[1]
     assert found.alone.mean < 0.1
-    # By sample it would seem to know everything.
-    x = own[episode].astype(np.float64)
-    x = np.hstack([x - x.mean(0), np.ones((600, 1))])
-    weights = np.linalg.lstsq(x[::2], store.array("tick/action")[::2, :4], rcond=None)[0]
-    error = ((store.array("tick/action")[1::2, :4] - x[1::2] @ weights) ** 2).mean(0)
-    assert (1 - error / store.array("tick/action")[:, :4].var(0)).min() > 0.9
 
 
 def test_a_slot_stands_at_its_mean_where_it_is_not_valid(store: FeatureStore, plain: Make) -> None:
@@ -163,9 +157,11 @@ def test_a_wide_group_is_read_along_its_main_directions(
     store: FeatureStore, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("pipeline.evaluate.probe.inputs.WIDTH", 12)
-    (group,) = probed(store).groups
+    study = probed(store)
+    (group,) = study.groups
     assert (group.channels, group.inputs) == (24, 12)
-    assert "main directions" in table(probed(store))
+    said = table(study)
+    assert all(result.name.label in said for result in (*study.slots, group))
 
 
 def test_threads_change_no_bit(store: FeatureStore) -> None:
@@ -195,9 +191,7 @@ def test_what_is_known_grows_by_what_the_store_has(
     names = [known.name for known in probed(store).known]
     assert names == ["past actions", "past actions + state", "past actions + state + sensor"]
     study = probed(FeatureStore.open(tiny_store(tmp_path, sensor_channels=0, state_dim=0)))
-    assert [known.name for known in study.known] == ["past actions"]
-    assert study.baseline.inputs == 2 * 5
-    assert "beside: together with past actions;" in table(study)
+    assert [(known.name, known.inputs) for known in study.known] == [("past actions", 2 * 5)]
 
 
 def test_a_slot_that_says_what_the_robot_just_did_gains_nothing(
@@ -272,7 +266,7 @@ def study_of(known: ProbeScore, *groups: tuple[int, ProbeScore, ProbeScore]) -> 
 
 
 def test_nothing_is_recommended_that_is_worse_than_what_is_known() -> None:
-    """Intervals so wide that all are within that of all."""
+    """Intervals so wide that all are within that of all; or one strange recording."""
     wild = by_recording(0.3, 0.1, 0.2, 0.2, -5600)
     worse = by_recording(0.4, 0.2, 0.2, 0.2, -170)
     less = by_recording(0.4, 0.2, 0.3, 0.2, -4)
@@ -280,9 +274,9 @@ def test_nothing_is_recommended_that_is_worse_than_what_is_known() -> None:
     study = study_of(wild, (1, poor, worse), (16, poor, less))
     assert recommend(study) is None
     assert "recommended" not in metrics(study)
-    said = advice(study)
-    assert said.startswith("no recommendation")
-    assert "params.yaml" not in said
+    assert advice(study).startswith("no recommendation")
+    known, saved = by_recording(0.1, 0.1, 0.1, 0.1, -90.0), by_recording(0.0, 0.0, 0.0, 0.0, 0.5)
+    assert recommend(study_of(known, (1, by_recording(0, 0, 0, 0, 0), saved))) is None
 
 
 def test_nothing_is_recommended_that_may_explain_nothing() -> None:
@@ -295,17 +289,13 @@ def test_nothing_is_recommended_that_may_explain_nothing() -> None:
 
 
 def test_features_that_help_alone_are_said_to() -> None:
-    wild = by_recording(0.3, 0.1, 0.2, 0.2, -5600)
-    beside = by_recording(0.4, 0.2, 0.3, 0.2, -4)
+    wild, beside = by_recording(0.3, 0.1, 0.2, 0.2, -5600), by_recording(0.4, 0.2, 0.3, 0.2, -4)
     good, better = by_recording(0.2, 0.1, 0.2, 0.3, 0.2), by_recording(0.4, 0.3, 0.4, 0.5, 0.4)
     study = study_of(wild, (1, good, beside), (16, better, beside))
     found = recommend(study)
     assert found is not None
     assert (found.reading, found.chosen.name.layer, found.tied) == ("alone", 1, ())
-    said = advice(study)
-    assert "features alone predict better than the mean action" in said
-    assert "does not show" not in said
-    assert "layers: [1]" in said
+    assert "features alone" in advice(study) and "layers: [1]" in advice(study)
 
 
 def test_a_tie_keeps_half_of_the_gain() -> None:
@@ -318,9 +308,3 @@ def test_a_tie_keeps_half_of_the_gain() -> None:
     assert found.best.beside is best
     assert [one.name.layer for one in found.tied] == [1]
     assert found.chosen.name.layer == 1
-
-
-def test_one_strange_recording_is_no_gain() -> None:
-    known = by_recording(0.1, 0.1, 0.1, 0.1, -90.0)
-    saved = by_recording(0.0, 0.0, 0.0, 0.0, 0.5)
-    assert recommend(study_of(known, (1, by_recording(0, 0, 0, 0, 0), saved))) is None
