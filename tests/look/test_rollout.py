@@ -128,9 +128,10 @@ def test_the_worst_fails_and_the_median_lies_in_the_middle() -> None:
     deep = failed(4, lateral_mm=0.0, depth_mm=-0.6)
     beside = failed(5, lateral_mm=3.0, depth_mm=0.0)
     episodes = [inserted, near, beside, far_but_inserted, deep]
-    assert worst_and_median(episodes) == (beside, near)
-    assert worst_and_median([near]) == (near, near)
-    assert worst_and_median([inserted, far_but_inserted]) == (far_but_inserted, inserted)
+    assert worst_and_median(episodes) == {"worst": beside, "median": near}
+    assert worst_and_median([near]) == {"worst": near}
+    both = worst_and_median([inserted, far_but_inserted])
+    assert both == {"worst": far_but_inserted, "median": inserted}
 
 
 def test_without_any_success_and_of_one_episode_of_one_tick() -> None:
