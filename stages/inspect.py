@@ -41,7 +41,7 @@ SHOWN = 8
 def main(params: "Params") -> None:
     """Write the page of what `inspect.path` names."""
     from pipeline.base.files import REPORT, claim
-    from pipeline.look.page.issues import FINDINGS
+    from pipeline.look.page.blocks import FINDINGS
     from pipeline.look.page.style import boxes
     from pipeline.look.page.writing import write_report
     from pipeline.look.subject import subject_of
@@ -67,8 +67,7 @@ def main(params: "Params") -> None:
 
 def summary(report: "Report") -> Iterator[str]:
     """The beginning of the page, for a terminal."""
-    from pipeline.look.page.blocks import Issues
-    from pipeline.look.page.issues import FINDINGS, group_issues, place_of, places_of
+    from pipeline.look.page.blocks import FINDINGS, Issues, group_issues, place_of, places_of
 
     yield report.title
     yield " · ".join(f"{label} {value}" for label, value in report.tiles)

@@ -6,21 +6,25 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
+from jaxtyping import Bool, Float
+from numpy.typing import NDArray
+from scipy.spatial.distance import cdist, pdist
 
+from pipeline.base.channels import action_groups
 from pipeline.base.config import EvaluateParams
 from pipeline.base.errors import ConfigError
+from pipeline.data.contact import contact_spans, force_columns
 from pipeline.evaluate.ablation import AblationStudy, evaluate_ablation
 from pipeline.evaluate.baselines import Baselines
-from pipeline.evaluate.curves import TrainingCurves, read_curves
 from pipeline.evaluate.figures import Figure, mean_over_ticks
-from pipeline.evaluate.phases import phases_of
-from pipeline.evaluate.samples import SampledChunks
+from pipeline.evaluate.sources import TrainingCurves, read_curves
 from pipeline.policy.checkpoint import PolicyCheckpoint
 from pipeline.policy.policy import Trainable
-from pipeline.store import FeatureStore
-from pipeline.train.batches import Windows
-from pipeline.train.predictions import Predictions, predict
+from pipeline.store import Episode, FeatureStore
+from pipeline.train.batches import Ticks, Windows
+from pipeline.train.predictions import Actions, Predictions, predict
 from pipeline.train.run import FREE_PARAMS
 from pipeline.train.scores import Comparison, action_space, compare
 from pipeline.train.split import hash64
@@ -28,6 +32,15 @@ from pipeline.train.training_data import find_ticks, groups_of, source_of
 
 JUDGED = "judged.json"
 """The document's name in the folder of an evaluation, beside metrics.json."""
+MEAN, BEST = "mean of n", "best of n"
+ENERGY = "energy score"
+APPROACH, CONTACT, HOLD = PHASES = ("approach", "contact", "hold")
+PHASE_RULE = (
+    "approach: out of contact by the force; contact: in it, moving; hold: in it, and the recorded "
+    "motion of the tick is below half of its median in the contacts of that recording"
+)
+_HOLD = 0.5
+"""A tick in contact is at hold if its motion is below this share of the usual motion there."""
 
 
 @dataclass(frozen=True)
@@ -168,3 +181,109 @@ def judged_document(
             },
         },
     }
+
+
+class SampledChunks:
+    """Collects the samples of a policy batch by batch; the `watch` of `predict`.
+
+    `scale` (action_dim,) is that of `Comparison`: a dimension that does not vary in training has no
+    weight.
+    """
+
+    def __init__(self, scale: Float[np.ndarray, " action_dim"]) -> None:
+        counted = scale > 0 if (scale > 0).any() else np.ones_like(scale, np.bool_)
+        self._per_std = np.where(counted, 1 / np.where(scale > 0, scale, 1), 0.0)
+        self._mean: list[Actions] = []
+        self._best: list[Actions] = []
+        self._energy: list[Float[np.ndarray, " tick"]] = []
+
+    def __call__(
+        self,
+        chunks: Float[np.ndarray, "sample tick horizon action_dim"],
+        recorded: Float[np.ndarray, "tick horizon action_dim"],
+        valid: Bool[np.ndarray, "tick horizon"],
+    ) -> None:
+        if len(chunks) < 2:
+            return
+        self._mean.append(chunks.mean(axis=0))
+        errors = np.abs(chunks - recorded) @ self._per_std
+        best = np.where(valid, errors, 0.0).sum(axis=2).argmin(axis=0)
+        self._best.append(chunks[best, np.arange(len(best))])
+        pairs = zip(chunks.swapaxes(0, 1), recorded, valid, strict=True)
+        self._energy.append(np.array([self._score(*pair) for pair in pairs]))
+
+    def chunks(self) -> dict[str, Actions]:
+        """The mean and the best of the samples, (tick, horizon, action_dim); empty with one sample.
+
+        The best has the lowest error over the valid entries. Only the recorded actions tell which
+        one it is, so it shows what the samples contain, not what a robot would do.
+        """
+        ways = {MEAN: self._mean, BEST: self._best}
+        return {name: np.concatenate(parts) for name, parts in ways.items() if parts}
+
+    def energy(self) -> Float[np.ndarray, " tick"]:
+        """The energy score of each tick's samples; empty with one sample.
+
+        Gneiting and Raftery (2007), eq. 21 with beta 1, negated so that lower is better: the mean
+        distance to the recorded chunk, minus half the mean distance between two different samples.
+        A distance is Euclidean over the valid entries of the chunk in training std, divided by the
+        square root of their number: for a single sample, its root mean square error.
+        """
+        return np.concatenate(self._energy) if self._energy else np.empty(0)
+
+    def _score(
+        self,
+        chunks: Float[np.ndarray, "sample horizon action_dim"],
+        recorded: Float[np.ndarray, "horizon action_dim"],
+        valid: Bool[np.ndarray, " horizon"],
+    ) -> float:
+        # Dimensions without weight are zero in all samples and add to no distance.
+        samples = (chunks[:, valid] * self._per_std).reshape(len(chunks), -1)
+        truth = (recorded[valid] * self._per_std).reshape(1, -1)
+        distance = cdist(samples, truth).mean() - pdist(samples).mean() / 2
+        return float(distance / np.sqrt(valid.sum() * np.count_nonzero(self._per_std)))
+
+
+def phases_of(store: FeatureStore, ticks: Ticks) -> NDArray[np.str_]:
+    """(tick,) one of `PHASES`, or empty where the recording has no force."""
+    phases = np.full(len(ticks), "", dtype="<U8")
+    names = store.streams["sensor"]["names"]
+    if columns := force_columns(names):
+        episodes = store.episode_of(ticks)
+        for index in np.unique(episodes):
+            here, episode = episodes == index, store.episodes[index]
+            phases[here] = _phases(store, episode, columns)[ticks[here] - episode.ticks.start]
+    return phases
+
+
+def _phases(store: FeatureStore, episode: Episode, columns: list[int]) -> NDArray[np.str_]:
+    """(tick,) the phase of each tick of an episode."""
+    first, stop = store.array("episode/sensor_start")[episode.index :][:2]
+    time = store.array("sensor/time")[first:stop]
+    phases = np.full(len(episode.ticks), APPROACH if len(time) else "", dtype="<U8")
+    units = {store.streams["sensor"]["units"][column] for column in columns}
+    force = store.array("sensor/values")[first:stop, columns]
+    step_s = float(np.median(np.diff(time))) if len(time) > 1 else 0.0
+    at = store.array("tick/time")[episode.ticks.start : episode.ticks.stop]
+    touching = np.zeros(len(at), np.bool_)
+    for begin, end in contact_spans(time, force, units == {"N"}, step_s):
+        touching |= (begin <= at) & (at <= end)
+    if touching.any():
+        motion = _motion(store, episode)
+        still = motion < _HOLD * np.median(motion[touching])
+        phases[touching] = np.where(still, HOLD, CONTACT)[touching]
+    return phases
+
+
+def _motion(store: FeatureStore, episode: Episode) -> NDArray[np.floating]:
+    """(tick,) the length of each recorded motion: of the translation, else of all but grippers.
+
+    The motion of an absolute action is its difference from the previous action.
+    """
+    action = store.streams["action"]
+    groups = np.array(action_groups(action["names"], action["units"]))
+    moving = groups == "translation" if "translation" in groups else groups != "gripper"
+    values = store.array("tick/action")[episode.ticks.start : episode.ticks.stop, moving]
+    if action["kind"] == "absolute":
+        values = np.diff(values, axis=0, prepend=values[:1])
+    return np.linalg.norm(values, axis=1)

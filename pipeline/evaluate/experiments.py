@@ -28,14 +28,6 @@ _SAME = 1e-4
 """The relative difference of two baselines that rounding on another machine can explain."""
 _OF_FEATURES = "nearest_neighbour"
 """The baseline that sees features, and so differs between stores of the same recordings."""
-_SHARED = {
-    "on": ("on the same test ticks, all folds together,", "recordings and folds"),
-    "drawn": ("from as many samples and ticks a batch", "evaluate.samples and evaluate.batch_size"),
-}
-"""The keys of `JudgedDocument` in which evaluations of one table must agree. For each: words for
-what they share, and which params must be the same."""
-
-
 _REPORT = Border(
     ConfigError,
     "compare.reports takes the output of stages.evaluate: evaluate that experiment again with this "
@@ -133,7 +125,7 @@ def read_experiments(reports: Path) -> tuple[Experiment, ...]:
     for experiment in map(_read_experiment, folders):
         runs.setdefault((experiment.judged.policy.recipe, *experiment.seeds), []).append(experiment)
     experiments = list(chain.from_iterable(map(_pooled, runs.values())))
-    for key in _SHARED:
+    for key in ("on", "drawn"):
         _check_shared(reports, experiments, key)
     for experiment, other in pairwise(experiments):
         _check_baselines(reports, experiment, other)
@@ -294,17 +286,17 @@ def _read_groups(path: Path) -> tuple[tuple[str, ...], dict[str, NDArray[np.floa
 
 
 def _check_shared(reports: Path, experiments: Sequence[Experiment], key: str) -> None:
-    """Raise `ConfigError` where evaluations that have this entry of `_SHARED` differ in it."""
-    alike, remedy = _SHARED[key]
+    """Raise `ConfigError` where evaluations that have this entry of their document differ in it."""
     documents = [(e.name, e.judged.model_dump(mode="json")[key]) for e in experiments]
     for (name, entry), (other_name, other) in pairwise(pair for pair in documents if pair[1]):
         if differing := differences(entry, other):
             lines = [f"  {line} ({other_name})" for line in describe(differing, f" ({name}), ")]
             raise ConfigError(
-                f"compare.reports: expected evaluations {alike} in {reports}, but:\n"
+                f"compare.reports: expected evaluations in {reports} on the same test ticks, all "
+                "folds together, from as many samples and ticks a batch, but:\n"
                 + "\n".join(lines)
-                + f"\nEvaluate all of them with the same {remedy}, or move those that do not "
-                "belong away."
+                + "\nEvaluate all of them with the same recordings, folds, evaluate.samples and "
+                "evaluate.batch_size, or move those that do not belong away."
             )
 
 

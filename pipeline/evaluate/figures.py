@@ -6,7 +6,6 @@ figures' draws is the paired bootstrap.
 """
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -60,6 +59,11 @@ class Figure:
     def verdict(self) -> str:
         """`resolved` in a word or two; empty without an interval."""
         return {None: "", True: "resolved", False: "not resolved"}[self.resolved]
+
+    def document(self, name: str = "value") -> dict[str, float]:
+        """The figure for a JSON document, with 6 significant digits, without what is None."""
+        numbers = {name: self.value, "low": self.low, "high": self.high}
+        return {key: float(f"{x:.6g}") for key, x in numbers.items() if x is not None}
 
     def columns(self, name: str) -> dict[str, float | None]:
         """The figure as columns of a table."""
@@ -175,8 +179,3 @@ def _draw(groups: int, draws: int, seed: int) -> NDArray[np.float64]:
 def with_unit(name: str, unit: str) -> str:
     """A name and, where it has one, its unit in brackets."""
     return f"{name} [{unit}]" if unit else name
-
-
-def rounded(values: Mapping[str, float | None]) -> dict[str, float]:
-    """The values for a JSON document: with 6 significant digits, without those that are None."""
-    return {key: float(f"{value:.6g}") for key, value in values.items() if value is not None}

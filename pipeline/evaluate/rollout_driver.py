@@ -1,14 +1,14 @@
 """A policy drives the simulated insertion closed loop, in this process or over the wire.
 
-One loop (`_Driver.drive`) steps several environments together. It has two drivers: one gets its
+`_Driver` runs all episodes and steps several environments together. It has two kinds: one gets its
 chunks from a policy in this process, the other from a server. The same seeds give the same figures,
 bit for bit on one machine.
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Final, Generic, TypeVar
+from typing import Any, ClassVar, Final, Generic, TypeVar
 
 import numpy as np
 import torch
@@ -48,8 +48,6 @@ SIDE_BY_SIDE: Final = 50
 
 Act = Callable[[Observation, Generators, Guide | None], Tensor]
 """Answers observations with chunks (robot, horizon, action), as `Policy.act` does."""
-Seen = TypeVar("Seen")
-"""The result of a pass of the model for one robot."""
 Chunk = NDArray[np.float32]
 Readings = Mapping[str, NDArray[Any]]
 
@@ -73,25 +71,30 @@ def roll_out(
     policy was not trained on, for chunking that its expert cannot do and for more steps than a
     chunk has.
     """
-    shape = checkpoint.shape
+    shape, source = checkpoint.shape, checkpoint.source
+    metadata = {key: source[key] for key in ("streams", "action_hz", "vlm_reuse_count")} | {
+        "checkpoint": name,
+        "step": checkpoint.step,
+        "weights": checkpoint.digest,
+        "model_type": policy.params.model_type,
+        "instructions": checkpoint.instructions,
+        "horizon": policy.params.horizon,
+        "moving": moving_channels(source["streams"]["action"]),
+        "stochastic": policy.stochastic and act is None,
+        "uses_features": "features" in policy.encoders,
+    }
     widths = {"action": shape.action_dim, "state": shape.state_dim, "sensor": shape.sensor_channels}
-    _refuse_other_robot(checkpoint.source, widths)
-    check_chunking(wanted.chunking, policy.stochastic and act is None)
-    Executor(wanted.chunking, wanted.execute, policy.params.horizon)
-    features = load_features() if "features" in policy.encoders else None
-    if features is not None:
-        prove(checkpoint, features, say)
-    instruction = _instruction_of(checkpoint.instructions)
+    driver = _LocalDriver(metadata, widths, wanted, checkpoint, policy, act or policy.act)
+    if metadata["uses_features"]:
+        driver.features = load_features()
+        prove(checkpoint, driver.features, say)
     alone = len(policy.encoders) == 1
     ablations: list[RolloutAblation] = [
-        name
-        for name in dict.fromkeys(wanted.ablations)
-        if name.split()[0] in policy.encoders and not (alone and name.endswith("off"))
+        ablation
+        for ablation in dict.fromkeys(wanted.ablations)
+        if ablation.split()[0] in policy.encoders and not (alone and ablation.endswith("off"))
     ]
-    settings = {"checkpoint": name, "step": checkpoint.step, "weights": checkpoint.digest}
-    settings |= {"model_type": policy.params.model_type, "instruction": instruction}
-    driver = _LocalDriver(checkpoint, policy, features, wanted, instruction, act or policy.act)
-    return _run_episodes(driver, checkpoint.source, ablations, wanted, settings, say)
+    return driver.run(ablations, say)
 
 
 def roll_out_served(
@@ -103,16 +106,12 @@ def roll_out_served(
     `rollout.execute` 1 a policy does the same as in `roll_out`, bit for bit if both compute one row
     at a time on one thread. No stream is ablated. Raises as `roll_out` does.
     """
-    metadata = server.metadata
-    streams = {name: metadata["streams"].get(name) for name in ("action", "state", "sensor")}
-    widths = {name: len(stream["names"]) if stream else 0 for name, stream in streams.items()}
-    _refuse_other_robot(metadata, widths)
-    check_chunking(wanted.chunking, metadata["stochastic"])
-    instruction = _instruction_of(metadata["instructions"])
-    settings = {name: metadata[name] for name in ("checkpoint", "step", "model_type")}
-    settings["instruction"] = instruction
-    driver = _ServedDriver(server, wanted, instruction)
-    return _run_episodes(driver, metadata, (), wanted, settings, say)
+    streams = server.metadata["streams"]
+    widths = {
+        name: len(streams[name]["names"]) if streams.get(name) else 0
+        for name in ("action", "state", "sensor")
+    }
+    return _ServedDriver(server.metadata, widths, wanted, server).run((), say)
 
 
 def _refuse_other_robot(source: Mapping[str, Any], widths: Mapping[str, int]) -> None:
@@ -152,51 +151,6 @@ def _instruction_of(trained: Sequence[str]) -> str:
     )
 
 
-def _run_episodes(
-    driver: "_Driver[Any]",
-    source: Mapping[str, Any],
-    ablations: Sequence[RolloutAblation],
-    wanted: RolloutParams,
-    settings: Mapping[str, Any],
-    say: Callable[[str], None],
-) -> Rollouts:
-    """Run the policy with each latency, then with each ablation, and the demonstrator.
-
-    `source` is what the policy was trained on; `settings` describe it, its `checkpoint` among them.
-    """
-    seeds = range(wanted.seed, wanted.seed + wanted.episodes)
-    side_by_side = driver.side_by_side
-    groups = [seeds[at : at + side_by_side] for at in range(0, len(seeds), side_by_side)]
-    episodes: list[RolloutEpisode] = []
-    first_ms, *others_ms = latencies_ms(wanted.latency_ms)
-    ways: list[tuple[str, float, RolloutAblation | None]] = [
-        (POLICY, first_ms, None),
-        *((late_name(latency_ms), latency_ms, None) for latency_ms in others_ms),
-        *((ablation, first_ms, ablation) for ablation in ablations),
-    ]
-    with tqdm(total=(1 + len(ways)) * len(seeds), unit="episode", disable=None) as bar:
-        for controller, latency_ms, ablation in ways:
-            bar.set_description(controller)
-            for group in groups:
-                environments = [_begin_episode(source, wanted.level, seed) for seed in group]
-                stops = driver.drive(environments, latency_ms / 1000, ablation, bar.update)
-                episodes += [
-                    _episode(controller, wanted.level, environment.insertion, stop)
-                    for environment, stop in zip(environments, stops, strict=True)
-                ]
-            rate = SuccessRate.of([e.success for e in episodes if e.controller == controller])
-            say(f"{controller_name(controller)}: {rate} of {rate.episodes} episodes")
-        bar.set_description(EXPERT)
-        for seed in seeds:
-            insertion = _begin_episode(source, wanted.level, seed).insertion
-            while not insertion.finished:
-                insertion.step(insertion.expert_action())
-            episodes.append(_episode(EXPERT, wanted.level, insertion, None))
-            bar.update()
-    params = wanted.model_dump(mode="json", exclude={"checkpoint", "output", "device"})
-    return Rollouts(settings["checkpoint"], params | dict(settings), tuple(episodes))
-
-
 def _begin_episode(source: Mapping[str, Any], level: Level, seed: int) -> InsertionEnvironment:
     """The phantom at the beginning of an episode, with actions as in a policy's `source`."""
     rotation = "rotvec" if "rx" in source["streams"]["action"]["names"] else "euler_delta"
@@ -229,44 +183,59 @@ def _episode(
 
 
 @dataclass
-class _Robot(ABC, Generic[Seen]):
+class _Unsent:
+    """What a server does not have yet; in the place of the `RobotMemory` of a policy here."""
+
+    ticks: list[Readings] = field(default_factory=list[Readings])
+    """The readings of each tick since the last observation."""
+    features: Mapping[str, Any] | None = None
+    """The newest frames with their times, empty once they are sent; None before the first."""
+
+    def sense(self, readings: Readings) -> None:
+        """Keep the readings, to send them with the next observation."""
+        self.ticks.append(readings)
+
+
+Memory = TypeVar("Memory", RobotMemory, _Unsent)
+
+
+@dataclass
+class _Robot(Generic[Memory]):
     """One environment with its control loop, and why it stopped safely."""
 
     environment: InsertionEnvironment
     loop: ControlLoop
+    memory: Memory
     latency_s: float
     """How long a pass of the model takes."""
-    stop: str | None = field(default=None, init=False)
-    time_s: float = field(default=0.0, init=False)
-    under_way: tuple[float, Seen] | None = field(default=None, init=False)
+    ablation: RolloutAblation | None
+    generator: torch.Generator
+    """Draws the noise of a policy in this process."""
+    stop: str | None = None
+    time_s: float = 0.0
+    under_way: tuple[float, Any] | None = None
     """When the current pass of the model ends, and its result; None without a pass."""
+    first: dict[str, NDArray[Any]] = field(default_factory=dict[str, NDArray[Any]])
+    """The fields of a frozen stream as they were first."""
 
     def sense(self, readings: Readings) -> None:
         """Begin a tick with the readings since the last one."""
         self.loop.begin_tick()
         self.time_s = float(readings["time"][0])
-        self.remember(readings)
+        self.memory.sense(readings)
         self._end_pass()
 
-    def see(self, seen: Seen) -> None:
-        """Begin a pass of the model; its result is ready `latency_s` from now."""
+    def see(self, seen: Any) -> None:
+        """Begin a pass of the model; its result is in the memory `latency_s` from now."""
         self.loop.pass_began()
         self.under_way = self.time_s + self.latency_s, seen
         self._end_pass()
 
     def _end_pass(self) -> None:
         if self.under_way is not None and self.time_s >= self.under_way[0] - 1e-9:
-            self.take(self.under_way[1])
+            self.memory.features = self.under_way[1]
             self.under_way = None
             self.loop.pass_ended()
-
-    @abstractmethod
-    def remember(self, readings: Readings) -> None:
-        """Keep these readings for the next observation."""
-
-    @abstractmethod
-    def take(self, seen: Seen) -> None:
-        """Keep the result of a pass for the next observation."""
 
     def plan(self, chunk: Chunk) -> None:
         """Take the requested chunk; a NaN or an infinity in it stops the robot."""
@@ -287,132 +256,161 @@ class _Robot(ABC, Generic[Seen]):
         return self.stop is None and not self.environment.insertion.finished
 
 
-AnyRobot = TypeVar("AnyRobot", bound=_Robot[Any])
-
-
-class _Driver(ABC, Generic[AnyRobot]):
+@dataclass
+class _Driver(ABC, Generic[Memory]):
     """Runs a policy on robots to the ends of their episodes."""
 
-    side_by_side: int
-    """The most robots that it drives together."""
+    side_by_side: ClassVar = 1
+    """The most robots that are driven together."""
+    metadata: Mapping[str, Any]
+    """Describes the policy, as a server does."""
+    widths: Mapping[str, int]
+    """Channels of action, state and sensor; 0 for a stream that the policy does not use."""
+    wanted: RolloutParams
 
-    def drive(
-        self,
-        environments: Sequence[InsertionEnvironment],
-        latency_s: float,
-        ablation: RolloutAblation | None,
-        ended: Callable[[], Any],
-    ) -> list[str | None]:
-        """Run the episodes to their ends; returns why each robot stopped safely, or None.
+    def __post_init__(self) -> None:
+        _refuse_other_robot(self.metadata, self.widths)
+        check_chunking(self.wanted.chunking, self.metadata["stochastic"])
+        self._executor()
+        self.instruction = _instruction_of(self.metadata["instructions"])
 
-        A pass of the model takes `latency_s`. `ended` is called for each episode that ends.
-        """
-        robots = [self.begin(environment, latency_s) for environment in environments]
+    def _executor(self) -> Executor:
+        wanted, metadata = self.wanted, self.metadata
+        return Executor(wanted.chunking, wanted.execute, metadata["horizon"], metadata["moving"])
+
+    def run(self, ablations: Sequence[RolloutAblation], say: Callable[[str], None]) -> Rollouts:
+        """Run the policy with each latency, then with each ablation, and the demonstrator."""
+        wanted = self.wanted
+        seeds = range(wanted.seed, wanted.seed + wanted.episodes)
+        groups = [
+            seeds[at : at + self.side_by_side] for at in range(0, len(seeds), self.side_by_side)
+        ]
+        episodes: list[RolloutEpisode] = []
+        first_ms, *others_ms = latencies_ms(wanted.latency_ms)
+        ways: list[tuple[str, float, RolloutAblation | None]] = [
+            (POLICY, first_ms, None),
+            *((late_name(latency_ms), latency_ms, None) for latency_ms in others_ms),
+            *((ablation, first_ms, ablation) for ablation in ablations),
+        ]
+        with tqdm(total=(1 + len(ways)) * len(seeds), unit="episode", disable=None) as bar:
+            for controller, latency_ms, ablation in ways:
+                bar.set_description(controller)
+                for group in groups:
+                    robots = [self._begin(seed, latency_ms / 1000, ablation) for seed in group]
+                    self._drive(robots, bar)
+                    episodes += [
+                        _episode(controller, wanted.level, robot.environment.insertion, robot.stop)
+                        for robot in robots
+                    ]
+                rate = SuccessRate.of([e.success for e in episodes if e.controller == controller])
+                say(f"{controller_name(controller)}: {rate} of {rate.episodes} episodes")
+            bar.set_description(EXPERT)
+            for seed in seeds:
+                insertion = _begin_episode(self.metadata, wanted.level, seed).insertion
+                while not insertion.finished:
+                    insertion.step(insertion.expert_action())
+                episodes.append(_episode(EXPERT, wanted.level, insertion, None))
+                bar.update()
+        settings = wanted.model_dump(mode="json", exclude={"checkpoint", "output", "device"})
+        described = ("checkpoint", "step", "weights", "model_type")
+        settings |= {key: self.metadata[key] for key in described}
+        settings["instruction"] = self.instruction
+        return Rollouts(settings["checkpoint"], settings, tuple(episodes))
+
+    def _begin(
+        self, seed: int, latency_s: float, ablation: RolloutAblation | None
+    ) -> _Robot[Memory]:
+        """A robot at the beginning of an episode, with its own generator of noise."""
+        environment = _begin_episode(self.metadata, self.wanted.level, seed)
+        reuse, uses_features = (self.metadata[k] for k in ("vlm_reuse_count", "uses_features"))
+        loop = ControlLoop(self._executor(), reuse, uses_features)
+        generator = torch.Generator().manual_seed(seed)
+        return _Robot(environment, loop, self.remember(seed), latency_s, ablation, generator)
+
+    def _drive(self, robots: Sequence[_Robot[Memory]], bar: "tqdm[Any]") -> None:
+        """Run the episodes of these robots to their ends."""
         for robot in robots:
             robot.sense(robot.environment.readings())
         active = robots
         while active:
-            for robot, chunk in self.chunks(active, ablation):
-                robot.plan(chunk)
+            if seeing := [robot for robot in active if self.looks(robot.loop)]:
+                self.look(seeing)
+            due = [
+                robot
+                for robot in active
+                if robot.loop.chunk_due
+                and (robot.memory.features is not None or not self.metadata["uses_features"])
+            ]
+            if due:
+                for robot, chunk in zip(due, self.answer(due), strict=True):
+                    robot.plan(chunk)
             for robot in active:
                 if robot.stop is None:
                     robot.step()
             going = [robot for robot in active if robot.active]
-            for _ in range(len(active) - len(going)):
-                ended()
+            bar.update(len(active) - len(going))
             active = going
-        return [robot.stop for robot in robots]
 
     @abstractmethod
-    def begin(self, environment: InsertionEnvironment, latency_s: float) -> AnyRobot:
-        """The robot of an environment whose episode begins."""
+    def remember(self, seed: int) -> Memory:
+        """The empty memory of a robot whose episode of this seed begins."""
+
+    def looks(self, loop: ControlLoop) -> bool:
+        """Whether the robot of this loop takes frames in this tick."""
+        return loop.frames_due
 
     @abstractmethod
-    def chunks(
-        self, active: Sequence[AnyRobot], ablation: RolloutAblation | None
-    ) -> Iterable[tuple[AnyRobot, Chunk]]:
-        """The robots whose chunk is due in this tick, each with its chunk (horizon, action)."""
+    def look(self, robots: Sequence[_Robot[Memory]]) -> None:
+        """Begin a pass of the model for each of these robots."""
+
+    @abstractmethod
+    def answer(self, robots: Sequence[_Robot[Memory]]) -> Sequence[Chunk] | Chunk:
+        """The chunk (horizon, action) of each of these robots."""
 
 
 @dataclass
-class _LocalRobot(_Robot[SeenFeatures]):
-    """A robot whose memory is in this process; it has its own generator of noise."""
+class _LocalDriver(_Driver[RobotMemory]):
+    """Drives robots by a policy in this process; robots share the passes of model and head.
 
-    memory: RobotMemory
-    generator: torch.Generator
-    first: dict[str, NDArray[Any]] = field(default_factory=dict[str, NDArray[Any]])
-    """The fields of a frozen stream as they were first."""
-
-    def remember(self, readings: Readings) -> None:
-        """Keep them in the memory."""
-        self.memory.sense(readings)
-
-    def take(self, seen: SeenFeatures) -> None:
-        """Make these features the newest."""
-        self.memory.features = seen
-
-
-@dataclass(frozen=True)
-class _LocalDriver(_Driver[_LocalRobot]):
-    """Drives robots by a policy in this process; `features` is the model, None if it needs none.
-
-    Each robot draws noise from a generator with its own seed, so it acts as it would alone.
+    Each robot draws noise from its own generator, so it acts as it would alone.
     """
 
     side_by_side = SIDE_BY_SIDE
     checkpoint: PolicyCheckpoint
     policy: Policy
-    features: LiveFeatures | None
-    wanted: RolloutParams
-    instruction: str
     act: Act
+    features: LiveFeatures | None = None
+    """The model; None if the policy needs none."""
 
-    def begin(self, environment: InsertionEnvironment, latency_s: float) -> _LocalRobot:
-        """The loop and the memory of a robot."""
-        wanted, source = self.wanted, self.checkpoint.source
-        moving = moving_channels(source["streams"]["action"])
-        executor = Executor(wanted.chunking, wanted.execute, self.policy.params.horizon, moving)
-        loop = ControlLoop(executor, source["vlm_reuse_count"], self.features is not None)
-        generator = torch.Generator().manual_seed(environment.insertion.layout.seed)
-        return _LocalRobot(environment, loop, latency_s, RobotMemory.of(self.policy), generator)
+    def remember(self, seed: int) -> RobotMemory:
+        """A memory with the windows of the policy."""
+        return RobotMemory.of(self.policy)
 
-    def chunks(
-        self, active: Sequence[_LocalRobot], ablation: RolloutAblation | None
-    ) -> Iterable[tuple[_LocalRobot, Chunk]]:
-        """One pass of the model for all due frames, then one of the head for all due chunks."""
-        self._look([robot for robot in active if robot.loop.frames_due])
-        due = [
-            robot
-            for robot in active
-            if robot.loop.chunk_due and (self.features is None or robot.memory.features is not None)
-        ]
-        return zip(due, self._act(due, ablation), strict=True) if due else ()
-
-    def _look(self, due: Sequence[_LocalRobot]) -> None:
-        if not due or self.features is None:
-            return
-        trained = self.checkpoint.source["streams"]["views"]
-        shots = [robot.environment.frames() for robot in due]
+    def look(self, robots: Sequence[_Robot[RobotMemory]]) -> None:
+        """One pass of the model for the frames of all robots."""
+        assert self.features is not None
+        trained = self.metadata["streams"]["views"]
+        shots = [robot.environment.frames() for robot in robots]
         taken = [{view: views[view] for view in trained} for views in shots]
         frames = [{view: frame for view, (_, frame) in views.items()} for views in taken]
         features, valid = self.features(frames, self.instruction)
         rows = zip(features.numpy(), valid.numpy(), strict=True)
-        for robot, views, (row, real) in zip(due, taken, rows, strict=True):
+        for robot, views, (row, real) in zip(robots, taken, rows, strict=True):
             times = np.array([time for time, _ in views.values()])
             robot.see(SeenFeatures(row, real, times))
 
-    def _act(self, due: Sequence[_LocalRobot], ablation: RolloutAblation | None) -> Chunk:
-        """The chunks (robot, horizon, action).
+    def answer(self, robots: Sequence[_Robot[RobotMemory]]) -> Chunk:
+        """The chunks (robot, horizon, action) of one pass of the head.
 
         A stream that is off keeps its true ages and gaps; all fields of a frozen one stay as they
         were first.
         """
-        guides = [robot.loop.ask() for robot in due]
-        fields = [robot.memory.observation() for robot in due]
-        if ablation is not None:
+        guides = [robot.loop.ask() for robot in robots]
+        fields = [robot.memory.observation() for robot in robots]
+        if (ablation := robots[0].ablation) is not None:
             name, how = ablation.split()
             mean = self.checkpoint.typical(name).astype(np.float32)
-            for robot, own in zip(due, fields, strict=True):
+            for robot, own in zip(robots, fields, strict=True):
                 if how == "off":
                     own[name] = np.broadcast_to(mean, own[name].shape)
                 else:
@@ -422,78 +420,49 @@ class _LocalDriver(_Driver[_LocalRobot]):
         streams = {name: np.stack([own[name] for own in fields]) for name in fields[0]}
         observation = self.policy.observe(streams)
         guide = stack_guides(guides, observation.features.device)
-        generators = [robot.generator for robot in due]
+        generators = [robot.generator for robot in robots]
         return self.act(observation, generators, guide).cpu().numpy()
 
 
 @dataclass
-class _ServedRobot(_Robot[Mapping[str, Any]]):
-    """A robot whose memory is on the server; the server gets frames with the model's latency."""
-
-    sees: bool
-    """Whether the server has frames of this episode, or needs none."""
-    unsent: list[Readings] = field(default_factory=list[Readings])
-    """The readings of each tick since the last observation."""
-    frames: Mapping[str, Any] = field(default_factory=dict[str, Any])
-    """The newest frames that are not sent yet, with their times."""
-
-    def remember(self, readings: Readings) -> None:
-        """Keep them, to send them with the next observation."""
-        self.unsent.append(readings)
-
-    def take(self, seen: Mapping[str, Any]) -> None:
-        """Keep them, to send them with the next observation."""
-        self.frames, self.sees = seen, True
-
-
-@dataclass(frozen=True)
-class _ServedDriver(_Driver[_ServedRobot]):
+class _ServedDriver(_Driver[_Unsent]):
     """Drives robots by a policy server, which remembers one robot for each connection."""
 
-    side_by_side = 1
     server: PolicyClient
-    wanted: RolloutParams
-    instruction: str
 
-    def begin(self, environment: InsertionEnvironment, latency_s: float) -> _ServedRobot:
-        """The loop of a robot; the server begins anew with its first observation."""
-        wanted, metadata = self.wanted, self.server.metadata
-        executor = Executor(
-            wanted.chunking, wanted.execute, metadata["horizon"], metadata["moving"]
-        )
-        loop = ControlLoop(executor, metadata["vlm_reuse_count"], metadata["uses_features"])
-        self.server.reset(environment.insertion.layout.seed)
-        return _ServedRobot(environment, loop, latency_s, sees=not metadata["uses_features"])
+    def remember(self, seed: int) -> _Unsent:
+        """Nothing unsent; the server begins anew with its first observation."""
+        self.server.reset(seed)
+        return _Unsent()
 
-    def chunks(
-        self, active: Sequence[_ServedRobot], ablation: RolloutAblation | None
-    ) -> Iterable[tuple[_ServedRobot, Chunk]]:
-        """The robots whose chunk is due, each with the server's answer; waits for each answer."""
-        assert ablation is None, "a served policy sees what there is"
-        for robot in active:
-            # Only if a question follows: the server counts ticks between questions with frames.
-            if robot.loop.frames_due and robot.loop.chunk_due:
-                self._photograph(robot)
-        asking = [robot for robot in active if robot.sees and robot.loop.chunk_due]
-        return [(robot, self._ask(robot)) for robot in asking]
+    def looks(self, loop: ControlLoop) -> bool:
+        """Only if a question follows: the server counts ticks between questions with frames."""
+        return loop.frames_due and loop.chunk_due
 
-    def _photograph(self, robot: _ServedRobot) -> None:
-        fields: dict[str, Any] = {}
-        taken = robot.environment.frames()
-        for view in self.server.metadata["streams"]["views"]:
-            time_s, frame = taken[view]
-            fields |= {f"images/{view}": frame, f"images_time/{view}": time_s}
-        robot.see(fields)
+    def look(self, robots: Sequence[_Robot[_Unsent]]) -> None:
+        """Take the frames that go along with the next question, with the model's latency."""
+        for robot in robots:
+            fields: dict[str, Any] = {}
+            taken = robot.environment.frames()
+            for view in self.metadata["streams"]["views"]:
+                time_s, frame = taken[view]
+                fields |= {f"images/{view}": frame, f"images_time/{view}": time_s}
+            robot.see(fields)
 
-    def _ask(self, robot: _ServedRobot) -> Chunk:
-        guide = robot.loop.ask()
+    def answer(self, robots: Sequence[_Robot[_Unsent]]) -> list[Chunk]:
+        """The server's answers; waits for each."""
+        return [self._ask(robot) for robot in robots]
+
+    def _ask(self, robot: _Robot[_Unsent]) -> Chunk:
+        guide, ticks = robot.loop.ask(), robot.memory.ticks
         observation: dict[str, Any] = {
-            name: np.concatenate([tick[name] for tick in robot.unsent]) for name in robot.unsent[0]
+            name: np.concatenate([tick[name] for tick in ticks]) for name in ticks[0]
         }
-        observation |= {"time": robot.unsent[-1]["time"], "prompt": self.instruction}
-        observation |= robot.frames
+        observation |= {"time": ticks[-1]["time"], "prompt": self.instruction}
+        observation |= robot.memory.features or {}
         if guide is not None:
             observation |= {"guide/chunk": guide.chunk, "guide/weight": guide.weight}
         answer = self.server.infer(observation)
-        robot.unsent, robot.frames = [], {}
+        robot.memory.ticks = []
+        robot.memory.features = {} if robot.memory.features is not None else None
         return answer["actions"]

@@ -14,7 +14,7 @@ from pipeline.base.files import write_document
 from pipeline.base.text import Table
 from pipeline.evaluate.ablation import AblationStudy
 from pipeline.evaluate.baselines import METHODS
-from pipeline.evaluate.evaluation import Evaluation
+from pipeline.evaluate.evaluation import BEST, ENERGY, MEAN, PHASE_RULE, PHASES, Evaluation
 from pipeline.evaluate.figures import (
     FEWEST_GROUPS,
     NO_INTERVAL,
@@ -24,12 +24,9 @@ from pipeline.evaluate.figures import (
     by_group,
     error,
     rivalry,
-    rounded,
     sums_by_group,
     with_unit,
 )
-from pipeline.evaluate.phases import PHASE_RULE, PHASES
-from pipeline.evaluate.samples import BEST, ENERGY, MEAN
 from pipeline.store import FeatureStore
 from pipeline.train.predictions import Predictions
 from pipeline.train.scores import ActionGroup, Comparison
@@ -40,14 +37,6 @@ FOOTNOTE = (
     "where they are absolute"
 )
 ABLATION_FOOTNOTE = "zeroed: every value at its training mean, which the policy sees as zeros"
-METRICS = "metrics.json"
-HEADLINE = "headline.json"
-"""The numbers that `dvc metrics` shows."""
-ERRORS = "errors.csv"
-"""The file with the errors of all methods over the whole chunk: a line for each action group and
-`OVERALL`."""
-EXECUTED = "executed.csv"
-"""The same file for the steps that are executed."""
 GROUPS = "groups.csv"
 """The file with the errors of all methods by group of test recordings."""
 OVERALL = "overall"
@@ -100,18 +89,18 @@ def metrics(comparison: Comparison, energy: Figure | None = None) -> dict[str, A
                 rivals if group in varying else {"policy": rivals["policy"]}
             )
     if sampled := sample_figures(comparison, energy):
-        document["samples"] = {name.replace(" ", "_"): _plain(f) for name, f in sampled.items()}
+        document["samples"] = {n.replace(" ", "_"): f.document() for n, f in sampled.items()}
     if phases := by_phase(comparison):
         document["phases"] = {
             phase: {"ticks": part.ticks}
-            | {scope: _plain(error(p, "policy")) for scope, p in scopes(part).items()}
+            | {scope: error(p, "policy").document() for scope, p in scopes(part).items()}
             for phase, part in phases.items()
         }
     return document
 
 
 def headline(figures: Mapping[str, Any]) -> dict[str, float]:
-    """The content of `headline.json`, of that of `metrics.json`: what decides between policies."""
+    """The content of `headline.json`, which `dvc metrics` shows, of that of `metrics.json`."""
     return {
         f"{scope}_error{suffix}": figures[scope][OVERALL][who]["value"]
         for scope in ("executed", "chunk")
@@ -121,11 +110,7 @@ def headline(figures: Mapping[str, Any]) -> dict[str, float]:
 
 def _rivals(rivals: Rivalry) -> dict[str, dict[str, float]]:
     figures = {"policy": rivals.policy, "best_baseline": rivals.baseline}
-    return {name: _plain(f) for name, f in (figures | {"difference": rivals.difference}).items()}
-
-
-def _plain(figure: Figure) -> dict[str, float]:
-    return rounded(vars(figure))
+    return {n: f.document() for n, f in (figures | {"difference": rivals.difference}).items()}
 
 
 def sample_figures(comparison: Comparison, energy: Figure | None) -> dict[str, Figure]:
@@ -279,8 +264,8 @@ def write_tables(folder: Path, evaluation: Evaluation) -> list[Path]:
     """
     comparison, store, study = evaluation.comparison, evaluation.store, evaluation.study
     files = {
-        EXECUTED: _group_errors(comparison.executed),
-        ERRORS: _group_errors(comparison),
+        "executed.csv": _group_errors(comparison.executed),
+        "errors.csv": _group_errors(comparison),
         GROUPS: _recording_groups(comparison),
         "dimensions.csv": _dimensions(comparison),
         "horizon.csv": _horizon(comparison),
@@ -291,10 +276,11 @@ def write_tables(folder: Path, evaluation: Evaluation) -> list[Path]:
         "streams.csv": _streams(study),
     }
     figures = metrics(comparison, evaluation.energy)
-    write_document(folder / METRICS, figures)
-    write_document(folder / HEADLINE, headline(figures))
-    tables = [files[name].write_csv(folder / name) for name in files]
-    return [folder / METRICS, folder / HEADLINE, *tables]
+    documents = {"metrics.json": figures, "headline.json": headline(figures)}
+    for name, document in documents.items():
+        write_document(folder / name, document)
+    tables = [table.write_csv(folder / name) for name, table in files.items()]
+    return [*(folder / name for name in documents), *tables]
 
 
 def _errors(comparison: Comparison, group: ActionGroup | None = None) -> dict[str, Any]:

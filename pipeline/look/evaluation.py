@@ -17,11 +17,10 @@ from pipeline.base.text import Table
 from pipeline.evaluate import tables
 from pipeline.evaluate.ablation import AblationStudy
 from pipeline.evaluate.baselines import METHODS
-from pipeline.evaluate.curves import TrainingCurves
-from pipeline.evaluate.episode_frames import read_episode_frames, shown_ticks
 from pipeline.evaluate.evaluation import Evaluation, trained_on_too
 from pipeline.evaluate.figures import NO_INTERVAL, best_baseline, error, rivalry, with_unit
 from pipeline.evaluate.figures import Figure as Merit
+from pipeline.evaluate.sources import TrainingCurves, read_episode_frames, shown_ticks
 from pipeline.look.page.blocks import Block, Outline, Picture, Report, Section, Text
 from pipeline.look.page.style import (
     INK,

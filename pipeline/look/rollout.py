@@ -93,8 +93,8 @@ def draw_latency(rates: Mapping[float, SuccessRate]) -> Figure:
     return figure
 
 
-def worst_and_median(episodes: Sequence[RolloutEpisode]) -> tuple[RolloutEpisode, RolloutEpisode]:
-    """The worst episode, and the one halfway between it and the best.
+def worst_and_median(episodes: Sequence[RolloutEpisode]) -> dict[str, RolloutEpisode]:
+    """The worst episode, and the median, halfway to the best; a single one is only the worst.
 
     Failures are worse than successes. Among equals, the greater the sum of the tip's distances from
     the target and from the layer (mm), the worse.
@@ -102,13 +102,8 @@ def worst_and_median(episodes: Sequence[RolloutEpisode]) -> tuple[RolloutEpisode
     ordered = sorted(
         episodes, key=lambda episode: (episode.success, -episode.lateral_mm - abs(episode.depth_mm))
     )
-    return ordered[0], ordered[len(ordered) // 2]
-
-
-def _extremes(episodes: Sequence[RolloutEpisode]) -> Mapping[str, RolloutEpisode]:
-    """The worst and the median; a single episode is only the worst."""
-    worst, median = worst_and_median(episodes)
-    return {"worst": worst} | ({} if median is worst else {"median": median})
+    both = {"worst": ordered[0], "median": ordered[len(ordered) // 2]}
+    return both if both["median"] is not ordered[0] else {"worst": ordered[0]}
 
 
 def _paths_and_courses(rollouts: Rollouts) -> list[Block]:
@@ -123,7 +118,7 @@ def _paths_and_courses(rollouts: Rollouts) -> list[Block]:
         "surface, and come to rest in the green band. Force is the largest in each tick; it falls "
         "when the needle punctures."
     )
-    strong = {f"{kind}, seed {e.seed}": e for kind, e in _extremes(episodes).items()}
+    strong = {f"{kind}, seed {e.seed}": e for kind, e in worst_and_median(episodes).items()}
     return [
         Picture("paths", above, partial(draw_paths, rollouts)),
         Picture("courses", over_time, partial(draw_courses, episodes, strong)),
@@ -214,7 +209,7 @@ def _filmstrips(episodes: Sequence[RolloutEpisode]) -> Iterator[Section]:
         "What the cameras saw at moments from the beginning to the end. While the needle presses "
         "and has not punctured, the layer gives way with it."
     )
-    for kind, episode in _extremes(episodes).items():
+    for kind, episode in worst_and_median(episodes).items():
         side = "short of" if episode.depth_mm > 0 else "beyond"
         words = (
             f"{sentence(episode.reason)} {episode.lateral_mm:.2f} mm sideways from the target at "

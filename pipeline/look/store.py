@@ -39,8 +39,6 @@ EPISODES = 100
 """The most episodes in the table; if there are more, it has the first."""
 DEAD = 1e-3
 """A slot is dead if the spread of its numbers is below this share of their size."""
-_STILL_ROWS = 3
-"""An episode needs so many VL rows for its features to count as still."""
 _STALE_PERIODS = 2
 """Features are old beyond this multiple of the period of VL rows."""
 _SAME_SHARE = 0.5
@@ -85,8 +83,6 @@ class FeatureHealth:
     """(row, slot) Euclidean; NaN where the slot is invalid or not finite."""
     variation: NDArray[np.float64]
     """(slot,) the median over its numbers of standard deviation / root mean square: 0 = dead."""
-    within: NDArray[np.float64]
-    """(episode, slot) the same within an episode; NaN with fewer than two rows."""
     broken: NDArray[np.bool_]
     """(row, slot) valid, but NaN or infinite."""
 
@@ -332,7 +328,6 @@ def measure_features(store: FeatureStore, rows: NDArray[np.int64]) -> FeatureHea
     episode = np.searchsorted(store.array("episode/vl_start"), rows, side="right") - 1
     norm = np.full((count, slots), np.nan, np.float32)
     variation = np.full(slots, np.nan)
-    within = np.full((len(store.episodes), slots), np.nan)
     broken = np.zeros((count, slots), np.bool_)
     for slot in tqdm(range(slots), desc="look at features", unit="slot", disable=None):
         values = read_slot(store, rows, slot)
@@ -341,11 +336,9 @@ def measure_features(store: FeatureStore, rows: NDArray[np.int64]) -> FeatureHea
         valid &= ~broken[:, slot]
         norm[valid, slot] = np.linalg.norm(values[valid], axis=1)
         variation[slot] = _variation(values[valid])
-        for index in np.unique(episode[valid]):
-            within[index, slot] = _variation(values[valid & (episode == index)])
     # Variants repeat the names.
     names = tuple(slot_name(document) for document in store.attrs["slots"][:slots])
-    return FeatureHealth(rows, episode, names, norm, variation, within, broken)
+    return FeatureHealth(rows, episode, names, norm, variation, broken)
 
 
 def read_slot(store: FeatureStore, rows: NDArray[np.int64], slot: int) -> NDArray[np.float32]:
@@ -363,11 +356,10 @@ def _variation(values: NDArray[np.float32]) -> float:
 
 
 def find_feature_issues(health: FeatureHealth, episodes: Sequence[Coverage]) -> Iterator[Issue]:
-    """Dead slots, features that stand still in an episode, and features that are not finite."""
+    """Dead slots, and features that are not finite."""
     if dead := np.flatnonzero(health.variation < DEAD).tolist():
         message = f"{named(health.names, dead)}: the same in all VL rows looked at"
         yield Issue(severity="warning", kind="dead slot", message=message, stream=FEATURES)
-    still = (health.within < DEAD) & (health.variation >= DEAD)
     for index, part in enumerate(episodes):
         own = health.episode == index
         if len(row := np.nonzero(health.broken[own])[0]):
@@ -375,10 +367,6 @@ def find_feature_issues(health: FeatureHealth, episodes: Sequence[Coverage]) -> 
             message = f"{len(np.unique(row))} VL row(s) are NaN or infinite, the first in slot "
             message += f"{health.names[slot]}; training refuses them: extract them anew"
             yield part.issue("not finite", FEATURES, message, severity="error")
-        if own.sum() >= _STILL_ROWS and still[index].any():
-            slots = named(health.names, np.flatnonzero(still[index]).tolist())
-            message = f"{slots}: the same in all {own.sum()} VL rows looked at of this episode"
-            yield part.issue("still features", FEATURES, message)
 
 
 def _feature_blocks(view: StoreView, total: int) -> list[Block]:

@@ -148,6 +148,7 @@ class ServedPolicy:
             ),
             "checkpoint": self._name,
             "step": self.checkpoint.step,
+            "weights": self.checkpoint.digest,
         }
 
 

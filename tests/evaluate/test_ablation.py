@@ -1,7 +1,7 @@
 """A stream that decides the action must be missed, and one that decides nothing must not."""
 
 import csv
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -22,7 +22,7 @@ from pipeline.evaluate.ablation import (
 )
 from pipeline.evaluate.baselines import Baselines
 from pipeline.evaluate.figures import rivalry
-from pipeline.evaluate.tables import ablation_text, write_tables
+from pipeline.evaluate.tables import ablation_table, ablation_text, write_tables
 from pipeline.policy.checkpoint import PolicyCheckpoint
 from pipeline.policy.normalization import ChannelStatistics, Normalization
 from pipeline.policy.policy import Policy
@@ -50,20 +50,15 @@ def trained(store: FeatureStore, steps: int, **params: object) -> tuple[PolicyCh
     """A policy trained on the third action, which is the newest reading's first channel."""
     wanted = TrainHeadParams.model_validate(PARAMS | params)
     split = split_by_episode(store, SplitParams(val=0, test=0.3))
-    action = store.array("tick/action")
     # Nothing but the sensor decides the action.
-    action[:, [0, 1, 3]] = 0.5
+    store.array("tick/action")[:, [0, 1, 3]] = 0.5
 
-    def statistics(values: np.ndarray) -> ChannelStatistics:
-        values = values.astype(np.float64)
+    def statistics(name: str) -> ChannelStatistics:
+        values = store.array(name).astype(np.float64)
         return ChannelStatistics(values.mean(0), values.std(0), len(values))
 
-    normalization = Normalization(
-        statistics(action),
-        statistics(store.array("vl/features")),
-        statistics(store.array("sensor/values")),
-        statistics(store.array("state/values")),
-    )
+    names = ("tick/action", "vl/features", "sensor/values", "state/values")
+    normalization = Normalization(*map(statistics, names))
     torch.manual_seed(0)
     shape = policy_shape(store, normalization)
     policy = Policy(wanted, shape, normalization)
@@ -75,31 +70,41 @@ def trained(store: FeatureStore, steps: int, **params: object) -> tuple[PolicyCh
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
-    checkpoint = PolicyCheckpoint(
-        params=wanted,
-        shape=shape,
-        normalization=normalization,
-        source=source_of(store),
-        split=split_parts(store, split),
-        step=steps,
-        weights=policy.state_dict(),
-    )
+    parts = {"split": split_parts(store, split), "step": steps, "weights": policy.state_dict()}
+    checkpoint = PolicyCheckpoint(wanted, shape, normalization, source_of(store), **parts)
     return checkpoint, policy.eval()
 
 
-def rules(store: FeatureStore) -> Baselines:
-    return Baselines(store, split_by_episode(store, SplitParams(val=0, test=0.3)).train, 1, None)
+def studied(
+    store: FeatureStore,
+    ticks: np.ndarray | None = None,
+    steps: int = 1,
+    samples: int = 1,
+    lacking: Sequence[int] = (),
+    **params: Any,
+) -> AblationStudy | None:
+    """The study of such a policy on these ticks, else on the test ticks.
 
-
-def held_out(store: FeatureStore) -> np.ndarray:
-    return split_by_episode(store, SplitParams(val=0, test=0.3)).test
+    The episodes `lacking` have no sensor once the policy is trained.
+    """
+    checkpoint, policy = trained(store, steps, **params)
+    split = split_by_episode(store, SplitParams(val=0, test=0.3))
+    start = store.array("episode/sensor_start")
+    for episode in lacking:
+        start[episode + 1] = start[episode]
+    rules = Baselines(store, split.train, 1, None)
+    here = split.test if ticks is None else ticks
+    return evaluate_ablation(checkpoint, policy, store, here, rules, 64, samples)
 
 
 @pytest.fixture(scope="module")
-def study(tiny_store: Make, tmp_path_factory: pytest.TempPathFactory) -> AblationStudy:
-    store = FeatureStore.open(tiny_store(tmp_path_factory.mktemp("study"), episodes=14))
-    checkpoint, policy = trained(store, 200)
-    found = evaluate_ablation(checkpoint, policy, store, held_out(store), rules(store), 64)
+def trained_store(tiny_store: Make, tmp_path_factory: pytest.TempPathFactory) -> FeatureStore:
+    return FeatureStore.open(tiny_store(tmp_path_factory.mktemp("study"), episodes=14))
+
+
+@pytest.fixture(scope="module")
+def study(trained_store: FeatureStore) -> AblationStudy:
+    found = studied(trained_store, steps=200)
     assert found is not None
     return found
 
@@ -111,16 +116,14 @@ def times(study: AblationStudy, stream: str, how: str) -> float:
     return ratio.value
 
 
-def test_a_stream_that_decides_the_action_is_missed(study: AblationStudy) -> None:
-    assert rivalry(study.intact).ratio < 0.5  # type: ignore[operator]
-    for how in ("zeroed", "shuffled", "delayed 50 ms", "delayed 100 ms", "delayed 200 ms"):
-        assert times(study, "sensor", how) > 2, how
-
-
-def test_a_stream_that_decides_nothing_is_not(study: AblationStudy) -> None:
-    for one in study.ablated:
-        if one.stream != "sensor":
-            assert times(study, one.stream, one.how) < 1.5, one.how
+def test_a_stream_that_decides_the_action_is_missed_and_others_are_not(
+    study: AblationStudy,
+) -> None:
+    ratio = rivalry(study.intact).ratio
+    assert ratio is not None and ratio < 0.5
+    for ablated in study.ablated:
+        multiple = times(study, ablated.stream, ablated.how)
+        assert multiple > 2 if ablated.stream == "sensor" else multiple < 1.5, ablated.how
 
 
 def test_the_ways_to_spoil_are_those_that_mean_something(study: AblationStudy) -> None:
@@ -137,67 +140,56 @@ def test_the_ways_to_spoil_are_those_that_mean_something(study: AblationStudy) -
 
 
 def test_the_figures_are_the_same_in_table_and_files(
-    study: AblationStudy, tiny_store: Make, tmp_path: Path
+    study: AblationStudy, trained_store: FeatureStore, tmp_path: Path
 ) -> None:
-    store = FeatureStore.open(tiny_store(tmp_path, episodes=14))
     multiple = times(study, "sensor", "zeroed")
     ticks = np.arange(4)
     predictions = Predictions(ticks, ticks * 0, *[np.zeros((4, 1, 5), np.float32)] * 2, ticks > 0)
     parts: dict[str, Any] = {"comparison": study.intact, "predictions": predictions}
-    evaluation: Any = SimpleNamespace(**parts, store=store, study=study, energy=None)
+    evaluation: Any = SimpleNamespace(**parts, store=trained_store, study=study, energy=None)
     write_tables(tmp_path, evaluation)
-    rows = list(csv.DictReader((tmp_path / "modalities.csv").read_text().splitlines()))
-    (row,) = (
-        row
-        for row in rows
-        if (row["stream"], row["how"], row["group"]) == ("sensor", "zeroed", "overall")
+    modalities, streams = (
+        list(csv.DictReader((tmp_path / name).read_text().splitlines()))
+        for name in ("modalities.csv", "streams.csv")
     )
+    keys = ("stream", "how", "group")
+    (row,) = [r for r in modalities if [r[k] for k in keys] == ["sensor", "zeroed", "overall"]]
     assert float(row["error"]) / float(row["intact_error"]) == pytest.approx(multiple, rel=1e-4)
-    (row,) = (
-        row
-        for row in csv.DictReader((tmp_path / "streams.csv").read_text().splitlines())
-        if row["spoilt"] == "sensor zeroed"
-    )
+    (row,) = [r for r in streams if r["spoilt"] == "sensor zeroed"]
     assert float(row["times_intact"]) == pytest.approx(multiple, rel=1e-5)
     assert float(row["times_intact_low"]) < multiple < float(row["times_intact_high"])
-    lines = ablation_text(study).splitlines()
-    assert any(line.startswith("sensor    zeroed") for line in lines)
-    assert lines[2].split()[:2] == ["all", "intact"]
-    assert any(line.startswith("none") for line in lines)
-    assert "1 chunk(s) a tick" in lines[0]
-    assert lines[-1 - len(study.notes)].startswith("zeroed: every value at its training mean")
-    assert lines[-len(study.notes) :] == list(study.notes)
+    rows = ablation_table(study).rows
+    assert [row[:2] for row in rows[:2]] == [["all", "intact"], ["sensor", "zeroed"]]
+    assert len(rows) == 2 + len(study.ablated) and rows[-1][0] == "none"
+    assert ablation_text(study).splitlines()[-len(study.notes) :] == list(study.notes)
 
 
 def test_missing_is_judged_where_training_dropped_the_stream(
     tiny_store: Make, tmp_path: Path
 ) -> None:
     store = FeatureStore.open(tiny_store(tmp_path))
-    checkpoint, policy = trained(store, 1, drop_sensor=0.2, robot_state_enabled=False)
-    found = evaluate_ablation(checkpoint, policy, store, held_out(store), rules(store), 64)
+    found = studied(store, drop_sensor=0.2, robot_state_enabled=False)
     assert found is not None
     assert {s.stream for s in found.ablated} == {"sensor", "features"}
     assert times(found, "sensor", "missing") > 0
-    first, *others = found.notes
-    left_out = len(held_out(store)) - found.intact.ticks
-    assert first.startswith(f"intact is not the error above: {left_out} of {len(held_out(store))}")
-    told = ["sensor delayed 200 ms", "features missing", "features delayed"]
-    assert [note.split(":")[0] for note in others] == told
-    assert "older than its window of 100 ms" in others[0]
+    first, late, *others = found.notes
+    assert first.startswith("intact is not the error above")
+    assert late.startswith("sensor delayed 200 ms") and "window of 100 ms" in late
+    assert [note.split(":")[0] for note in others] == ["features missing", "features delayed"]
 
 
 def test_one_held_out_episode_has_nobody_to_be_shuffled_with(
     tiny_store: Make, tmp_path: Path
 ) -> None:
-    store = FeatureStore.open(tiny_store(tmp_path))
-    checkpoint, policy = trained(store, 1)
-    found = evaluate_ablation(checkpoint, policy, store, np.arange(30, 60), rules(store), 64)
+    store = FeatureStore.open(tiny_store(tmp_path, reuse=1))
+    found = studied(store, np.arange(30, 60))
     assert found is not None
     assert not [one for one in found.ablated if one.how == "shuffled"]
     assert sum("shuffled: not judged" in note for note in found.notes) == 3
+    assert found.notes[-1].endswith("of 100 ms each")
     # The first ticks of an episode, at which a delay would find nothing, are not judged.
     assert found.intact.ticks == 27
-    assert evaluate_ablation(checkpoint, policy, store, np.arange(30, 33), rules(store), 64) is None
+    assert studied(store, np.arange(30, 33)) is None
 
 
 def test_donors_are_of_other_episodes(store: FeatureStore) -> None:
@@ -236,18 +228,13 @@ def test_a_stream_is_ablated_where_the_episodes_have_it(
 ) -> None:
     """Of three episodes with 27 ticks each, some lack the sensor."""
     store = FeatureStore.open(tiny_store(tmp_path))
-    checkpoint, policy = trained(store, 1)
-    start = store.array("episode/sensor_start")
-    for episode in lacking:
-        start[episode + 1] = start[episode]
-    found = evaluate_ablation(checkpoint, policy, store, np.arange(90), rules(store), 64)
+    found = studied(store, np.arange(90), lacking=lacking)
     assert found is not None and found.intact.ticks == 81
     assert {one.comparison.ticks for one in found.ablated if one.stream == "state"} == {81}
     of_sensor = [one for one in found.ablated if one.stream == "sensor"]
     assert {one.comparison.ticks for one in of_sensor} == ({judged} if judged else set())
     assert all(one.intact.ticks == judged for one in of_sensor)
-    note = f"sensor: judged on the {judged} of 81 ticks whose episode has it"
-    assert note in found.notes
+    assert f"sensor: judged on the {judged} of 81 ticks whose episode has it" in found.notes
 
 
 def test_an_alteration_leaves_the_batch_and_the_other_streams_alone(store: FeatureStore) -> None:
@@ -268,19 +255,11 @@ def test_an_alteration_leaves_the_batch_and_the_other_streams_alone(store: Featu
     assert other.action is batch.action
 
 
-def test_features_go_back_whole_rows_and_say_the_true_time(
-    tiny_store: Make, tmp_path: Path
-) -> None:
+def test_features_go_back_whole_rows(tiny_store: Make, tmp_path: Path) -> None:
     store = FeatureStore.open(tiny_store(tmp_path, reuse=1))
-    assert delays(store, "features") == {
-        "delayed 100 ms": Lags(features=1),
-        "delayed 200 ms": Lags(features=2),
-    }
+    lags = {"delayed 100 ms": Lags(features=1), "delayed 200 ms": Lags(features=2)}
+    assert delays(store, "features") == lags
     assert delays(store, "state")["delayed 50 ms"] == Lags(state_s=0.05)
-    checkpoint, policy = trained(store, 1)
-    found = evaluate_ablation(checkpoint, policy, store, np.arange(30, 60), rules(store), 64)
-    assert found is not None
-    assert found.notes[-1].endswith("of 100 ms each")
 
 
 @pytest.mark.parametrize(("ticks", "how"), [(2, "delayed 330 ms"), (1, "delayed inf ms")])
@@ -299,13 +278,7 @@ def test_the_time_between_episodes_is_no_step_of_ticks(
 
 def test_a_study_of_a_sampling_policy_is_of_few_samples(tiny_store: Make, tmp_path: Path) -> None:
     store = FeatureStore.open(tiny_store(tmp_path))
-    checkpoint, policy = trained(store, 1, model_type="flow_matching")
-    ticks = held_out(store)
-    many, few = (
-        evaluate_ablation(checkpoint, policy, store, ticks, rules(store), 64, samples=asked)
-        for asked in (16, 4)
-    )
+    many, few = (studied(store, model_type="flow_matching", samples=asked) for asked in (16, 4))
     assert many is not None and few is not None
     assert many.samples == few.samples == 4
-    assert "4 chunk(s) a tick" in ablation_text(many)
     assert few.intact.overall("policy") == many.intact.overall("policy")

@@ -45,13 +45,11 @@ def errors(mean: float, seed: int = 0, spread: float = 0.3) -> np.ndarray:
 
 
 def test_an_interval_holds_its_value_and_is_of_groups_not_of_ticks() -> None:
-    found = compared(errors(1.0), errors(1.0, 1))
-    figure = error(found, "policy")
+    figure = error(compared(errors(1.0), errors(1.0, 1)), "policy")
     assert figure.low is not None and figure.high is not None
     assert figure.low < figure.value < figure.high
     assert figure.value == pytest.approx(errors(1.0).mean() / 2)
-    halves = compared(errors(1.0), errors(1.0, 1), groups=2)
-    wider = error(halves, "policy")
+    wider = error(compared(errors(1.0), errors(1.0, 1), groups=2), "policy")
     assert wider.value == figure.value and (wider.low, wider.high) != (figure.low, figure.high)
 
 

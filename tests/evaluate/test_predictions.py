@@ -1,12 +1,15 @@
 """What is judged of a policy that samples, and what the feed changes of what it sees."""
 
+from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from scipy.special import erf
 
+from pipeline.base.errors import NumericsError
 from pipeline.evaluate.ablation import feed_maker
 from pipeline.store import FeatureStore
 from pipeline.train import predictions
@@ -17,23 +20,9 @@ WINDOWS = Windows(horizon=4, sensor_window=2, state_window=2)
 TICKS = np.arange(30, 51)
 
 
-class Noisy(torch.nn.Module):
-    """Each chunk is one draw from a standard normal distribution, the whole chunk long."""
+class StandIn(torch.nn.Module):
+    """As much of a policy as `predict` needs; remembers how many samples it was asked for."""
 
-    stochastic = True
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.weight = torch.nn.Parameter(torch.ones(1))
-        self.asked: list[int] = []
-
-    def sample(self, batch, samples=1, generator=None):
-        self.asked.append(samples)
-        shape = (samples, len(batch), 1, 1)
-        return torch.randn(shape, generator=generator).expand(-1, -1, 4, 5) * self.weight
-
-
-class NewestReading(torch.nn.Module):
     stochastic = False
 
     def __init__(self) -> None:
@@ -43,7 +32,21 @@ class NewestReading(torch.nn.Module):
 
     def sample(self, batch, samples=1, generator=None):
         self.asked.append(samples)
-        return batch.sensor[None, :, -1:, :1].expand(samples, -1, 4, 5) * self.weight
+        return self.chunks(batch, samples, generator) * self.weight
+
+    def chunks(self, batch, samples, generator):
+        """Acts by the newest reading, so that what it was given shows in what comes out."""
+        return batch.sensor[None, :, -1:, :1].expand(samples, -1, 4, 5)
+
+
+class Noisy(StandIn):
+    """Each chunk is one draw from a standard normal distribution, the whole chunk long."""
+
+    stochastic = True
+
+    def chunks(self, batch, samples, generator):
+        shape = (samples, len(batch), 1, 1)
+        return torch.randn(shape, generator=generator).expand(-1, -1, 4, 5)
 
 
 def run(policy: torch.nn.Module, store: FeatureStore, samples: int, **more) -> Predictions:
@@ -81,18 +84,18 @@ def test_no_more_chunks_at_once_than_memory_is_promised(
 
 
 def test_a_policy_that_does_not_sample_is_asked_once(store: FeatureStore) -> None:
-    policy = NewestReading()
+    policy = StandIn()
     run(policy, store, 16)
     assert policy.asked == [1, 1, 1]
 
 
 def test_the_policy_sees_what_the_feed_hands_out(store: FeatureStore) -> None:
     device = torch.device("cpu")
-    seen = run(NewestReading(), store, 1).predicted[:, 0, 0]
+    seen = run(StandIn(), store, 1).predicted[:, 0, 0]
     readings = store.array("sensor/values")[:, 0]
     end = store.array("tick/sensor_end")[TICKS]
     assert np.array_equal(seen, readings[end - 1])
-    late = run(NewestReading(), store, 1, feed=feed_maker(store, WINDOWS, device, Lags(0, 0.1)))
+    late = run(StandIn(), store, 1, feed=feed_maker(store, WINDOWS, device, Lags(0, 0.1)))
     expected = store.gather(TICKS, sensor_window=2, sensor_lag_s=0.1).sensor[:, -1, 0]
     assert np.array_equal(late.predicted[:, 0, 0], expected.numpy())
     assert not np.array_equal(late.predicted[:, 0, 0], seen)
@@ -103,9 +106,34 @@ def test_the_policy_sees_what_the_feed_hands_out(store: FeatureStore) -> None:
         calls.append(len(draw.ticks))
         return replace(batch, sensor=-batch.sensor)
 
-    altered = run(
-        NewestReading(), store, 1, feed=feed_maker(store, WINDOWS, device, NO_LAGS, negated)
-    )
+    altered = run(StandIn(), store, 1, feed=feed_maker(store, WINDOWS, device, NO_LAGS, negated))
     assert np.array_equal(altered.predicted[:, 0, 0], -seen)
     assert calls == [8, 8, 5]
     assert np.array_equal(altered.recorded, late.recorded)
+
+
+def test_predictions_belong_to_their_ticks(store: FeatureStore) -> None:
+    ticks = np.arange(25, 65)
+    found = predict(StandIn(), store, ticks, WINDOWS, 7)  # type: ignore[arg-type]
+    newest = store.array("tick/sensor_end")[ticks] - 1
+    assert np.array_equal(found.predicted[:, 0, 0], store.array("sensor/values")[newest, 0])
+    expected = store.gather(ticks, horizon=4)
+    assert np.array_equal(found.recorded, expected.action.numpy())
+    assert np.array_equal(found.valid, expected.action_valid.numpy())
+    assert found.episodes.tolist() == [0] * 5 + [1] * 30 + [2] * 5
+
+
+@pytest.mark.parametrize("what", ["recorded action", "action of the policy"])
+def test_a_number_that_is_none_is_named_by_episode_tick_and_time(
+    tiny_store: Callable[..., Path], tmp_path: Path, what: str
+) -> None:
+    store = FeatureStore.open(tiny_store(tmp_path))
+    if what == "recorded action":
+        store.array("tick/action")[37, 3] = np.nan
+    else:
+        store.array("sensor/values")[store.array("tick/sensor_end")[37] - 1, 0] = np.inf
+    with pytest.raises(NumericsError, match=what) as caught:
+        predict(StandIn(), store, np.arange(30, 60), WINDOWS, 8)  # type: ignore[arg-type]
+    assert "right/episode_001, tick 7 (at 0.700 s)" in str(caught.value)
+    # Beyond the end of an episode nothing was recorded, so nothing can be wrong there.
+    assert len(predict(StandIn(), store, np.arange(26, 30), WINDOWS, 8).ticks)  # type: ignore[arg-type]

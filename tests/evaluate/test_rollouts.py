@@ -55,27 +55,21 @@ def made(
     model_type: str = "regression", views: int = 3, **changed: Any
 ) -> tuple[PolicyCheckpoint, Policy, Glance]:
     """A policy of few random weights, its checkpoint, and what stands for its model."""
+    small = {"layers": 0, "heads": 1, "output_dim": 8}
     params = TrainHeadParams.model_validate(
         {
             "model_type": model_type,
             "horizon": 4,
             "sensor_window": 10,
             "state_window": 10,
-            "sensor_encoder": {"channels": [8], "layers": 0, "heads": 1, "output_dim": 8},
-            "state_encoder": {"dim": 8, "layers": 0, "heads": 1, "output_dim": 8},
+            "sensor_encoder": small | {"channels": [8]},
+            "state_encoder": small | {"dim": 8},
             "expert": {"dim": 8, "layers": 1, "heads": 1},
         }
         | changed
     )
-    shape = PolicyShape(
-        SLOTS,
-        DIM,
-        1026,
-        12,
-        7,
-        ("translation",) * 3 + ("rotation",) * 3 + ("gripper",),
-        views=views,
-    )
+    groups = ("translation",) * 3 + ("rotation",) * 3 + ("gripper",)
+    shape = PolicyShape(SLOTS, DIM, 1026, 12, 7, groups, views=views)
     normal = no_normalization(shape)
     # So that a random policy moves by tenths of a millimetre.
     action = replace(normal.action, std=np.full(7, 0.05), mean=np.array([0, 0, -0.1, 0, 0, 0, 1.0]))
@@ -85,6 +79,18 @@ def made(
     held = {"split": {"train": {}, "val": {}, "test": {}}, "step": 1, "weights": {}}
     checkpoint = PolicyCheckpoint(params, shape, normal, SOURCE, **held)
     return checkpoint, policy, Glance()
+
+
+def watch(monkeypatch: pytest.MonkeyPatch, policy: Policy) -> list[dict[str, np.ndarray]]:
+    """What the policy is given in each pass, by field (robot, …); it grows with every pass."""
+    given, observe = list[dict[str, np.ndarray]](), policy.observe
+
+    def watched(streams: Any) -> Any:
+        given.append({name: np.array(value) for name, value in streams.items()})
+        return observe(streams)
+
+    monkeypatch.setattr(policy, "observe", watched)
+    return given
 
 
 def wanted(**changed: Any) -> RolloutParams:
@@ -119,17 +125,20 @@ def test_every_controller_meets_the_same_episodes(rollouts: Rollouts) -> None:
         for episode in rollouts.of(controller):
             insertion = NeedleInsertion()
             insertion.reset(episode.seed, "full")
-            first = insertion.trace()
-            np.testing.assert_array_equal(episode.trace.offset_mm[0], first.offset_mm[0])
+            first = insertion.trace().offset_mm[0]
+            np.testing.assert_array_equal(episode.trace.offset_mm[0], first)
             assert 1 <= episode.ticks <= MAX_TICKS and episode.ticks == len(episode.trace.time_s)
             assert set(episode.frames(0.3)) == set(VIEWS)
     assert all(episode.success for episode in rollouts.of("expert"))
     assert {episode.reason for episode in rollouts.of("policy")} != {"inserted"}
-
-
-def test_a_policy_that_draws_nothing_continues_no_plan() -> None:
-    with pytest.raises(ConfigError, match=r"rollout\.chunking"):
-        rolled(made("regression"), chunking="rtc")
+    document = rollouts.document()
+    assert document["success"] == document["levels"]["full"]
+    assert document["success"]["expert"]["rate"] == 1.0
+    columns = "seed,level,success,reason,lateral_mm,depth_mm,overshoot_mm,max_force_n,time_s,ticks"
+    head, *lines = rollouts.table(policy=True).csv().splitlines()
+    assert head == columns and len(lines) == 3
+    head, *lines = rollouts.table(policy=False).csv().splitlines()
+    assert head == f"controller,{columns}" and len(lines) == 3 * 3
 
 
 @pytest.mark.parametrize(
@@ -189,28 +198,30 @@ def test_robots_share_a_pass_of_the_model_and_are_told_the_task() -> None:
         assert not np.array_equal(frame, photograph(view, robot.insertion, time))
 
 
-def test_the_model_sees_only_the_views_that_the_policy_was_trained_on() -> None:
+def test_the_model_gets_the_views_and_the_task_that_the_policy_was_trained_on() -> None:
     checkpoint, policy, glance = made(views=2)
     streams = {"action": ACTION, "views": ["View2", "View5"]}
-    fewer = replace(checkpoint, source=SOURCE | {"streams": streams})
-    rolled((fewer, policy, glance), episodes=1, ablations=())
+    told = replace(checkpoint, source=SOURCE | {"streams": streams}, instructions=("Go there",))
+    rollouts = rolled((told, policy, glance), episodes=1, ablations=())
     assert {tuple(views) for frames in glance.passes for views in frames} == {("View2", "View5")}
+    assert glance.instructions == {"Go there"} == {rollouts.settings["instruction"]}
+    several = replace(checkpoint, instructions=("Go there", "Stay"))
+    with pytest.raises(ConfigError, match="'Go there', 'Stay'"):
+        rolled((several, policy, glance), episodes=1)
 
 
-def test_what_the_policy_sees_is_as_old_as_it_says(monkeypatch: pytest.MonkeyPatch) -> None:
-    for latency in (0, 400):
-        parts = made()
-        ages, observe = [], parts[1].observe
-
-        def watched(streams: Any, observe: Any = observe, ages: Any = ages) -> Any:
-            ages.append(float(streams["feature_age"][0]))
-            return observe(streams)
-
-        monkeypatch.setattr(parts[1], "observe", watched)
-        rolled(parts, ablations=(), episodes=1, latency_ms=latency)
-        # Cameras run at 10 Hz, passes begin every third tick or when the model is free.
-        assert latency / 1000 < min(ages) and max(ages) < latency / 1000 + 0.33 + latency / 1000
-        assert np.ptp(ages) > 0.15
+@pytest.mark.parametrize("latency_ms", [0, 400])
+def test_what_the_policy_sees_is_as_old_as_it_says(
+    latency_ms: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    parts = made()
+    given = watch(monkeypatch, parts[1])
+    rolled(parts, ablations=(), episodes=1, latency_ms=latency_ms)
+    ages = [float(streams["feature_age"][0]) for streams in given]
+    # Cameras run at 10 Hz, passes begin every third tick or when the model is free.
+    latency_s = latency_ms / 1000
+    assert latency_s < min(ages) and max(ages) < latency_s + 0.33 + latency_s
+    assert np.ptp(ages) > 0.15
 
 
 def test_several_latencies_are_rolled_out_in_the_same_episodes() -> None:
@@ -230,18 +241,11 @@ def test_a_stream_that_is_off_says_nothing(monkeypatch: pytest.MonkeyPatch) -> N
     checkpoint, policy, glance = made()
     normal = checkpoint.normalization
     spread = {
-        name: replace(getattr(normal, name), mean=np.full(shape, 0.25))
-        for name, shape in policy.shape.channels.items()
-        if name in ("sensor", "features")
+        name: replace(getattr(normal, name), mean=np.full(policy.shape.channels[name], 0.25))
+        for name in ("sensor", "features")
     }
     checkpoint = replace(checkpoint, normalization=replace(normal, **spread))
-    given, observe = [], policy.observe
-
-    def watched(streams: Any) -> Any:
-        given.append({name: np.array(value) for name, value in streams.items()})
-        return observe(streams)
-
-    monkeypatch.setattr(policy, "observe", watched)
+    given = watch(monkeypatch, policy)
     rolled((checkpoint, policy, glance), episodes=1)
     for stream, other in (("sensor", "features"), ("features", "sensor")):
         silent = [seen for seen in given if (seen[stream] == 0.25).all()]
@@ -255,18 +259,10 @@ def test_a_frozen_stream_tells_what_it_told_first(
     stream: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     parts = made()
-    given: list[dict[str, np.ndarray]] = []
-    observe = parts[1].observe
-
-    def watched(streams: Any) -> Any:
-        given.append({name: np.array(value) for name, value in streams.items()})
-        return observe(streams)
-
-    monkeypatch.setattr(parts[1], "observe", watched)
+    given = watch(monkeypatch, parts[1])
     rollouts = rolled(parts, episodes=2, ablations=(f"{stream} frozen",))
     assert rollouts.controllers == ("policy", f"{stream} frozen", "expert")
-    ticks = max(episode.ticks for episode in rollouts.of("policy"))
-    frozen = given[ticks:]
+    frozen = given[max(episode.ticks for episode in rollouts.of("policy")) :]
     assert len(frozen) > 5
     for robots in frozen:
         for name in (key for key in robots if stream_of(key) == stream):
@@ -304,6 +300,13 @@ def test_streams_that_a_policy_lacks_are_passed_over() -> None:
     parts = made(features_enabled=False)
     rollouts = rolled(parts, episodes=1, ablations=("features off", "state off"))
     assert rollouts.controllers == ("policy", "state off", "expert")
+    # One whose store lacks sensor and state, so that they have no channels.
+    checkpoint, _, glance = made()
+    shape = replace(checkpoint.shape, sensor_channels=0, state_dim=0)
+    normal = replace(checkpoint.normalization, sensor=None, state=None)
+    policy = Policy(checkpoint.params, shape, normal).eval()
+    without = replace(checkpoint, shape=shape, normalization=normal)
+    assert len(rolled((without, policy, glance), episodes=1).of("policy")) == 1
 
 
 def test_an_action_that_is_no_number_stops_its_robot_alone(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -326,26 +329,6 @@ def test_an_action_that_is_no_number_stops_its_robot_alone(monkeypatch: pytest.M
     assert calls[3:5] == [3, 2]
 
 
-def test_a_policy_without_streams_runs() -> None:
-    """One whose store lacks them, so that they have no channels."""
-    checkpoint, _, glance = made()
-    shape = replace(checkpoint.shape, sensor_channels=0, state_dim=0)
-    normal = replace(checkpoint.normalization, sensor=None, state=None)
-    policy = Policy(checkpoint.params, shape, normal).eval()
-    without = replace(checkpoint, shape=shape, normalization=normal)
-    assert len(rolled((without, policy, glance), episodes=1).of("policy")) == 1
-
-
-def test_instructions_are_those_that_the_policy_was_trained_on() -> None:
-    checkpoint, policy, glance = made()
-    told = replace(checkpoint, instructions=("Go there",))
-    rollouts = rolled((told, policy, glance), episodes=1, ablations=())
-    assert glance.instructions == {"Go there"} == {rollouts.settings["instruction"]}
-    several = replace(checkpoint, instructions=("Go there", "Stay"))
-    with pytest.raises(ConfigError, match="'Go there', 'Stay'"):
-        rolled((several, policy, glance), episodes=1)
-
-
 @pytest.mark.parametrize(
     ("source", "said"),
     [
@@ -359,30 +342,16 @@ def test_a_policy_of_another_robot_is_refused(source: dict[str, Any], said: str)
     other = replace(checkpoint, source=SOURCE | source)
     with pytest.raises(CheckpointMismatch, match=said):
         rolled((other, policy, glance))
+    with pytest.raises(ConfigError, match=r"rollout\.chunking"):
+        rolled((checkpoint, policy, glance), chunking="rtc")
     assert not glance.passes
 
 
 def test_intervals_are_wilsons() -> None:
-    def rate(successes: int, episodes: int) -> SuccessRate:
-        return SuccessRate.of([index < successes for index in range(episodes)])
-
-    # Newcombe 1998, Table I, method 3.
-    known = {(81, 263): (0.2553, 0.3662), (15, 148): (0.0624, 0.1605), (0, 20): (0, 0.1611),
-             (29, 29): (0.8830, 1.0)}  # fmt: skip
-    for (successes, episodes), (low, high) in known.items():
-        interval = rate(successes, episodes)
-        assert (interval.low, interval.high) == pytest.approx((low, high), abs=6e-5)
-
-
-def test_metrics_and_table_say_the_same(rollouts: Rollouts) -> None:
-    document = rollouts.document()
-    assert document["success"] == document["levels"]["full"]
-    assert document["success"]["expert"]["rate"] == 1.0
-    lines = rollouts.table(policy=True).csv().splitlines()
-    assert lines[0].startswith("seed,level,success,reason,lateral_mm,depth_mm,overshoot_mm,")
-    assert lines[0].endswith(",max_force_n,time_s,ticks") and len(lines) == 1 + 3
-    beside = rollouts.table(policy=False).csv().splitlines()
-    assert beside[0] == f"controller,{lines[0]}" and len(beside) == 1 + 3 * 3
+    """Newcombe 1998, Table I, method 3."""
+    for successes, episodes, ends in ((81, 263, (0.2553, 0.3662)), (0, 20, (0, 0.1611))):
+        rate = SuccessRate.of([index < successes for index in range(episodes)])
+        assert (rate.low, rate.high) == pytest.approx(ends, abs=6e-5)
 
 
 def test_the_model_proves_itself_before_the_first_episode(monkeypatch: pytest.MonkeyPatch) -> None:

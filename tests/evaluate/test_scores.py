@@ -2,21 +2,16 @@
 
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.base.errors import NumericsError
 from pipeline.evaluate.baselines import BASELINES
 from pipeline.evaluate.figures import rivalry
-from pipeline.store import FeatureStore
-from pipeline.train.batches import Windows
-from pipeline.train.predictions import Predictions, predict
+from pipeline.train.predictions import Predictions
 from pipeline.train.scores import ActionGroup, Comparison, compare
 
 Recorded = Callable[..., Predictions]
@@ -65,8 +60,7 @@ def test_errors_worked_out_by_hand() -> None:
 def test_a_horizon_no_episode_reaches_has_no_error_and_counts_nowhere(
     recorded: Recorded, compared: Compared
 ) -> None:
-    last = recorded(np.array([29, 59]), error=1.0)
-    score = compared(last).scores["policy"]
+    score = compared(recorded(np.array([29, 59]), error=1.0)).scores["policy"]
     assert score.mae == pytest.approx(np.ones(5))
     assert np.isnan(score.mae_horizon[1:]).all()
 
@@ -123,76 +117,22 @@ def test_what_hardly_moves_beside_its_like_is_told_and_can_be_left_out(
 
 
 @pytest.mark.parametrize(
-    "changed",
+    ("changed", "still"),
     [
-        {"units": ("mm", "mm", "mm", "rad", "rad")},
-        {"scale": np.array([0.0, 0.0, 0.0, 1.0, 0.001])},
+        ({}, {3, 4}),
+        ({"names": ("kHip", "kKnee", "kAnkle", "kElbow", "kWrist")}, {3, 4}),
+        ({"units": ("mm", "mm", "mm", "rad", "rad")}, set()),
+        ({"scale": np.array([0.0, 0.0, 0.0, 1.0, 0.001])}, set()),
     ],
 )
-def test_what_has_no_like_is_not_still(
-    recorded: Recorded, compared: Compared, changed: dict[str, Any]
+def test_only_what_has_its_like_may_be_still(
+    recorded: Recorded, compared: Compared, changed: dict[str, Any], still: set[int]
 ) -> None:
+    """Joints that are called after limbs are alike by their unit."""
     comparison = compared(recorded(np.arange(60)))
     assert comparison.low_variance() == {}
-    still = joints(comparison, [1.0, 1.0, 1.0, 0.001, 0.001])
-    assert still.low_variance().keys() == {3, 4}
-    assert replace(still, **changed).low_variance() == {}
-
-
-def test_joints_that_are_called_after_limbs_are_alike_by_their_unit(
-    recorded: Recorded, compared: Compared
-) -> None:
-    still = joints(compared(recorded(np.arange(60))), [1.0, 1.0, 1.0, 1.0, 0.001])
-    names = ("kHip", "kKnee", "kAnkle", "kElbow", "kWrist")
-    assert replace(still, names=names).low_variance().keys() == {4}
-
-
-class FirstFeature(torch.nn.Module):
-    """Acts by the batch alone, so that what `predict` hands to it shows in what comes out."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.weight = torch.nn.Parameter(torch.ones(1))
-
-    stochastic = False
-
-    def sample(self, batch, samples=1, generator=None):
-        return batch.features[None, :, :1, :1].expand(samples, -1, 4, 5) * self.weight
-
-
-def test_predictions_belong_to_their_ticks(store: FeatureStore) -> None:
-    ticks = np.arange(25, 65)
-    windows = Windows(horizon=4, sensor_window=2, state_window=2)
-    found = predict(FirstFeature(), store, ticks, windows, 7)  # type: ignore[arg-type]
-    rows = store.array("tick/vl_row")[ticks]
-    assert np.array_equal(found.predicted[:, 0, 0], store.array("vl/features")[rows, 0, 0])
-    expected = store.gather(ticks, horizon=4)
-    assert np.array_equal(found.recorded, expected.action.numpy())
-    assert np.array_equal(found.valid, expected.action_valid.numpy())
-    assert found.episodes.tolist() == [0] * 5 + [1] * 30 + [2] * 5
-
-
-WINDOWS = Windows(horizon=4, sensor_window=2, state_window=2)
-
-
-@pytest.mark.parametrize("what", ["recorded action", "action of the policy"])
-def test_a_number_that_is_none_is_named_by_episode_tick_and_time(
-    tiny_store: Callable[..., Path], tmp_path: Path, what: str
-) -> None:
-    store = FeatureStore.open(tiny_store(tmp_path))
-    if what == "recorded action":
-        store.array("tick/action")[37, 3] = np.nan
-    else:
-        store.array("vl/features")[store.array("tick/vl_row")[37], 0, 0] = np.inf
-    with pytest.raises(NumericsError) as caught:
-        predict(FirstFeature(), store, np.arange(30, 60), WINDOWS, 8)  # type: ignore[arg-type]
-    said = str(caught.value)
-    # The VL row of tick 37 serves ticks 36 to 38.
-    place = "tick 7 (at 0.700 s)" if what == "recorded action" else "tick 6 (at 0.600 s)"
-    assert f"right/episode_001, {place}" in said
-    assert what in said
-    # Beyond the end of an episode nothing was recorded, so nothing can be wrong there.
-    assert len(predict(FirstFeature(), store, np.arange(26, 30), WINDOWS, 8).ticks)  # type: ignore[arg-type]
+    changed_joints = replace(joints(comparison, [1.0, 1.0, 1.0, 0.001, 0.001]), **changed)
+    assert changed_joints.low_variance().keys() == still
 
 
 def test_the_overall_error_of_episodes_of_one_length_is_their_mean(

@@ -13,8 +13,8 @@ import pytest
 
 from pipeline.base.errors import DiskFull
 from pipeline.evaluate.baselines import BASELINES, METHODS
-from pipeline.evaluate.figures import Figure, rivalry
-from pipeline.evaluate.tables import FOOTNOTE, HEADINGS, error_text, metrics, write_tables
+from pipeline.evaluate.figures import NO_INTERVAL, Figure, rivalry
+from pipeline.evaluate.tables import error_table, error_text, metrics, write_tables
 from pipeline.store import FeatureStore
 from pipeline.train.predictions import Predictions
 from pipeline.train.scores import Comparison, compare
@@ -69,9 +69,7 @@ def test_several_executed_steps_have_the_first_beside_them(comparison: Compariso
     document = metrics(several)
     assert list(document) == ["test", "executed", "first_step", "chunk"]
     assert document["first_step"] == metrics(comparison)["executed"]
-    lines = error_text(several).splitlines()
-    assert lines[0] == "what is executed, the first 3 steps of 4, with 95 % intervals:"
-    assert "; first step -" in lines[-1]
+    assert "first step" in error_text(several).splitlines()[-1]
 
 
 def test_samples_and_phases_are_there_where_they_are_known(
@@ -92,25 +90,17 @@ def test_samples_and_phases_are_there_where_they_are_known(
     assert "by phase" not in error_text(comparison)
 
 
-def test_the_text_is_two_tables_and_few_lines(comparison: Comparison) -> None:
-    lines = error_text(comparison).splitlines()
-    methods = ["policy", "zero", "median", "repeat last", "linear fit", "nearest neighbour"]
-    for first, title in ((0, "what is executed, step 0 of 4"), (9, "the whole chunk of 4 step(s)")):
-        assert lines[first] == f"{title}, with 95 % intervals:"
-        assert lines[first + 1].startswith("mean absolute error  translation [mm]")
-        assert [line.split("  ")[0] for line in lines[first + 2 : first + 8]] == methods
-    footnote, samples, verdict = lines[18:]
-    assert footnote == FOOTNOTE and samples.startswith("the expert gives one chunk a tick")
-    assert verdict.startswith("policy minus best baseline [training std]: executed -")
-    assert verdict.count("resolved better") == 2
+def test_the_text_has_both_tables_and_the_verdicts(comparison: Comparison) -> None:
+    text = error_text(comparison)
+    for part in (comparison.executed, comparison):
+        assert "\n".join(error_table(part).text()) in text
+    assert text.splitlines()[-1].count("resolved better") == 2
 
 
 def test_of_one_group_it_is_said_that_there_is_no_interval(
     recorded: Callable[..., Predictions], compared: Callable[[Predictions], Comparison]
 ) -> None:
-    text = error_text(compared(recorded(np.arange(30, 60), 0.1)))
-    assert text.endswith("intervals take at least two groups of test recordings")
-    assert "(" not in text.splitlines()[2]
+    assert error_text(compared(recorded(np.arange(30, 60), 0.1))).endswith(NO_INTERVAL)
 
 
 def test_dimensions_that_hardly_move_are_said_below_the_table(comparison: Comparison) -> None:
@@ -119,14 +109,9 @@ def test_dimensions_that_hardly_move_are_said_below_the_table(comparison: Compar
     scale = np.array([0.05, 0.06, 0.07, 1e-9, 0.0])
     still = replace(comparison, names=names, units=("",) * 5, scale=scale)
     moving = replace(still, scale=np.array([0.05, 0.06, 0.07, 0.0, 0.0]))
-    error = f"{moving.overall('policy'):.3f}, {rivalry(moving).ratio:.2f} times the best baseline's"
-    best = HEADINGS[min(BASELINES, key=moving.overall)]
     *_, line = error_text(still).splitlines()
-    assert line == (
-        "hardly moving: joint_3 (training std at most 1e-09, where 0.07 is usual for such "
-        "dimensions), 1 of the 4 dimensions in the overall error; without, that of the chunk is "
-        f"{error} ({best})"
-    )
+    assert line.startswith("hardly moving: joint_3 ") and "1 of the 4 dimensions" in line
+    assert f"{moving.overall('policy'):.3f}, {rivalry(moving).ratio:.2f} times the best" in line
     overall = metrics(still)["chunk"]["overall"]["policy"]["value"]
     assert overall == pytest.approx(still.overall("policy"), rel=1e-5)
     assert moving.overall("policy") < 0.01 * still.overall("policy")

@@ -1,6 +1,7 @@
 """Experiments side by side are one page: a table for each span of the chunk, and one picture."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,8 +10,9 @@ import pytest
 from pipeline.base.text import Table
 from pipeline.evaluate.baselines import BASELINES
 from pipeline.evaluate.experiments import SPANS, Experiment, JudgedDocument
+from pipeline.evaluate.figures import NO_INTERVAL
 from pipeline.look.comparison import comparison_report, draw_experiments
-from pipeline.look.page.writing import PAGE, write_report
+from pipeline.look.page.writing import PAGE, sentence, write_report
 
 
 @pytest.fixture
@@ -60,33 +62,21 @@ def test_experiments_are_one_page(
 
 
 def test_bars_have_whiskers_and_seeds_are_dots(experiments: list[Experiment]) -> None:
-    figure = draw_experiments(experiments)
-    executed, chunk = figure.axes
+    executed, chunk = draw_experiments(experiments).axes
     assert [patch.get_width() for patch in executed.patches] == pytest.approx([0.3, 0.5])
     assert [patch.get_width() for patch in chunk.patches] == pytest.approx([0.5, 0.4])
     whiskers = [line.get_xdata() for line in executed.lines if line.get_marker() == "|"]
-    assert len(whiskers) == 2
     assert all(low < error < high for (low, high), error in zip(whiskers, (0.3, 0.5), strict=True))
     (dots,) = (line.get_xdata() for line in executed.lines if line.get_marker() == ".")
     assert dots == pytest.approx([0.4, 0.6])
-    rules = [line for line in executed.lines if line.get_marker() not in ("|", ".")]
-    assert len(rules) == len(BASELINES)
-    names = [label.get_text() for label in executed.get_yticklabels()]
-    assert names == [experiment.name for experiment in experiments]
 
 
 def test_one_group_is_drawn_without_whiskers_and_it_is_said(experiments: list[Experiment]) -> None:
     first = experiments[0]
-    alone = Experiment(
-        **{
-            **vars(first),
-            "groups": first.groups[:1],
-            "entries": {span: entries[:1] for span, entries in first.entries.items()},
-            "errors": {key: errors[:, :1] for key, errors in first.errors.items()},
-        }
-    )
-    said = "of 1 group(s) of recordings. Intervals take at least two groups"
-    assert said in comparison_report([alone]).summary
-    assert "Intervals take" not in comparison_report(experiments).summary
+    entries = {span: entries[:1] for span, entries in first.entries.items()}
+    errors = {key: errors[:, :1] for key, errors in first.errors.items()}
+    alone = replace(first, groups=first.groups[:1], entries=entries, errors=errors)
+    assert sentence(NO_INTERVAL) in comparison_report([alone]).summary
+    assert sentence(NO_INTERVAL) not in comparison_report(experiments).summary
     executed, _ = draw_experiments([alone]).axes
     assert not [line for line in executed.lines if line.get_marker() == "|"]

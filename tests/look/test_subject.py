@@ -31,37 +31,19 @@ def test_without_a_path_it_is_the_sources_of_the_params() -> None:
     assert subject.folder == Path("reports/inspect")
 
 
-def test_a_path_that_is_not_there_is_named(tmp_path: Path) -> None:
-    said = refused(tmp_path / "monday" / "run")
-    assert f"inspect.path: expected a folder, found nothing at {tmp_path / 'monday/run'}" in said
-    assert "Name the folder of recordings, or a store" in said
-
-
-def test_a_file_is_no_recording(tmp_path: Path) -> None:
-    (tmp_path / "run.zip").write_bytes(b"")
-    said = refused(tmp_path / "run.zip")
-    assert f"found the file {tmp_path / 'run.zip'}" in said and "Name the folder" in said
-
-
-def test_a_foreign_file_or_folder_is_told_what_it_looks_like(tmp_path: Path) -> None:
-    buffer = tmp_path / "umi.zarr"
-    buffer.mkdir()
-    (buffer / ".zgroup").write_text("{}")
-    (tmp_path / "demo.hdf5").write_bytes(b"")
-    for path, what in ((buffer, "a zarr replay buffer"), (tmp_path / "demo.hdf5", "HDF5")):
-        assert f"looks like {what}" in refused(path)
-        assert refused(path).endswith("docs/recipes/reader.md")
-
-
-def test_a_folder_with_nothing_in_it_names_the_markers(tmp_path: Path) -> None:
-    said = refused(tmp_path)
-    assert str(tmp_path) in said
-    for marker in ("metadata.json", "meta/info.json"):
-        assert marker in said
-
-
-def test_a_glob_that_matches_nothing_says_so(tmp_path: Path) -> None:
+def test_a_path_that_means_nothing_is_told_what_it_is(tmp_path: Path) -> None:
+    assert f"found nothing at {tmp_path / 'monday/run'}" in refused(tmp_path / "monday" / "run")
+    (tmp_path / "empty").mkdir()
+    said = refused(tmp_path / "empty")
+    assert str(tmp_path) in said and "metadata.json" in said and "meta/info.json" in said
     assert "matches nothing" in refused(tmp_path / "day*")
+    (tmp_path / "run.zip").write_bytes(b"")
+    assert f"found the file {tmp_path / 'run.zip'}" in refused(tmp_path / "run.zip")
+    (tmp_path / "umi.zarr").mkdir()
+    (tmp_path / "umi.zarr" / ".zgroup").write_text("{}")
+    (tmp_path / "demo.hdf5").write_bytes(b"")
+    for name, what in (("umi.zarr", "a zarr replay buffer"), ("demo.hdf5", "HDF5")):
+        assert f"looks like {what}" in refused(tmp_path / name)
 
 
 def test_a_store_is_known_by_its_content(tmp_path: Path, tiny_store: Callable[..., Path]) -> None:

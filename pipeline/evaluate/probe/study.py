@@ -13,9 +13,8 @@ from tqdm import tqdm
 
 from pipeline.base.config import ProbeParams
 from pipeline.evaluate.figures import Figure
-from pipeline.evaluate.probe.folds import ProbeFolds, fold_by_recording
 from pipeline.evaluate.probe.inputs import Inputs, SlotName, past_actions, read_slots, summarize
-from pipeline.evaluate.probe.ridge import ProbeScore, cross_validate
+from pipeline.evaluate.probe.ridge import ProbeFolds, ProbeScore, cross_validate, fold_by_recording
 from pipeline.policy.normalization import fit_channels
 from pipeline.store import FeatureStore
 from pipeline.train.statistics import check_finite

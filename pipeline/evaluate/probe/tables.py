@@ -8,7 +8,6 @@ import numpy as np
 
 from pipeline.base.files import write_document
 from pipeline.base.text import Table
-from pipeline.evaluate.figures import Figure, rounded
 from pipeline.evaluate.probe.study import ProbeResult, ProbeStudy, ranked, recommend
 
 TOP = 12
@@ -40,13 +39,13 @@ def metrics(study: ProbeStudy) -> dict[str, Any]:
         "folds": study.folds.count,
         "horizon": study.horizon,
         "repeats": len(study.folds.deals),
-        "mean_action": _document(study.mean_action.r2),
-        "known": {known.name: _document(known.score.r2) for known in study.known},
+        "mean_action": study.mean_action.r2.document("r2"),
+        "known": {known.name: known.score.r2.document("r2") for known in study.known},
         "groups": {
             result.name.label: {
-                "alone": _document(result.alone.r2),
-                "beside": _document(result.beside.r2),
-                "gain": _document(study.gain(result)),
+                "alone": result.alone.r2.document("r2"),
+                "beside": result.beside.r2.document("r2"),
+                "gain": study.gain(result).document("r2"),
             }
             for result in ranked(study.groups)
         },
@@ -157,7 +156,3 @@ def _target_rows(study: ProbeStudy) -> list[dict[str, Any]]:
             r2 = {f"r2_{reading}": score.by_target[index] for reading, score in scores.items()}
             rows.append({**named, "step": step, "channel": channel, **r2})
     return rows
-
-
-def _document(figure: Figure) -> dict[str, float]:
-    return rounded({"r2": figure.value, "low": figure.low, "high": figure.high})

@@ -24,10 +24,19 @@ from pipeline.base.files import (
     sync,
 )
 from pipeline.base.text import as_yaml
-from pipeline.look.page.blocks import Block, Issues, Picture, Report, Section
-from pipeline.look.page.issues import FINDINGS, findings_csv, group_issues, place_of, places_of
-from pipeline.look.page.style import NO_FONT, RC, boxes, write
-from pipeline.look.page.svg import inline_svg
+from pipeline.look.page.blocks import (
+    FINDINGS,
+    Block,
+    Issues,
+    Picture,
+    Report,
+    Section,
+    findings_csv,
+    group_issues,
+    place_of,
+    places_of,
+)
+from pipeline.look.page.style import NO_FONT, RC, boxes, inline_svg, write
 
 PAGE = "report.html"
 OPEN_GROUPS = 12

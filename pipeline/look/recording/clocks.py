@@ -85,11 +85,6 @@ class Clock:
         return _usual(self.time)[0]
 
     @cached_property
-    def longest_step_s(self) -> float:
-        """The longest step; 0 for fewer than two entries."""
-        return float(np.diff(self.time).max(initial=0))
-
-    @cached_property
     def shortest_gap_s(self) -> float:
         """`GAP_FACTOR` times the longest usual step.
 
@@ -170,16 +165,17 @@ def _merge_equal(clocks: Iterable[Clock]) -> list[Clock]:
 
 
 def find_clock_issues(view: EpisodeView) -> Iterator[Issue]:
-    """Issues of kind gap, clock jump, repeated times, dropped frames and lost ticks.
+    """Issues of kind gap, repeated times, dropped frames and lost ticks.
 
     A gap shorter than a tick is no issue: no tick loses a reading by it.
     """
     recorded = [clock for clock in read_clocks(view) if clock.kind in ("camera", "stream")]
     for clock in _merge_equal(recorded):
+        expected = f"expected one every {clock.step_s:.3g} s"
         for gap in clock.gaps:
             if gap.length_s > _tick_s(view):
-                kind, message = _describe_gap(view, clock, gap, recorded)
-                yield view.issue(kind, clock.name, message, *gap)
+                message = f"no entry for {gap.length_s:.2f} s, {expected}"
+                yield view.issue("gap", clock.name, message, *gap)
         still = int(np.count_nonzero(np.diff(clock.time) == 0))
         if still > REPEATED * (len(clock.time) - 1):
             message = f"{still} of {len(clock.time)} entries have the time of the entry before"
@@ -187,32 +183,6 @@ def find_clock_issues(view: EpisodeView) -> Iterator[Issue]:
         if clock.kind == "camera":
             yield from _dropped(view, clock)
     yield from _lost_ticks(view, recorded)
-
-
-def _describe_gap(
-    view: EpisodeView, clock: Clock, gap: Gap, recorded: Sequence[Clock]
-) -> tuple[str, str]:
-    """Kind and message: entries are missing, or the clock was set."""
-    if apart := _ends_apart(clock, gap, recorded):
-        moved, at = gap.length_s - clock.step_s, gap.start_s - view.zero
-        words = f"the clock jumps by {moved:.2f} s at {at:.2f} s: it ends {apart[0]:.2f} s from "
-        return "clock jump", f"{words}the nearest other clock, {apart[1]:.2f} s without"
-    return "gap", f"no entry for {gap.length_s:.2f} s, expected one every {clock.step_s:.3g} s"
-
-
-def _ends_apart(clock: Clock, gap: Gap, recorded: Sequence[Clock]) -> tuple[float, float] | None:
-    """Seconds from the clock's end to the nearest end of a clock without such a gap.
-
-    The second number is the same without the gap. None if entries are missing: then the clock ends
-    with the others. A clock that was set does not end with them, but would without the jump.
-    """
-    ends = [c.time[-1] for c in recorded if c.longest_step_s < gap.length_s / 2]
-    if not ends:
-        return None
-    end = float(clock.time[-1])
-    moved = gap.length_s - clock.step_s
-    apart, left = (float(np.abs(at - np.array(ends)).min()) for at in (end, end - moved))
-    return (apart, left) if apart >= LOST_S and left < apart / 2 else None
 
 
 def _dropped(view: EpisodeView, clock: Clock) -> Iterator[Issue]:
@@ -238,8 +208,8 @@ def _dropped(view: EpisodeView, clock: Clock) -> Iterator[Issue]:
 
 def _lost_ticks(view: EpisodeView, recorded: Sequence[Clock]) -> Iterator[Issue]:
     """A stream that begins after most of the others or ends before most of them."""
-    # A clock that was set has its own issue, and says nothing of where the others end.
-    clocks = [c for c in recorded if not any(_ends_apart(c, gap, recorded) for gap in c.gaps)]
+    # A clock that was set during the recording has a gap, and cannot say when its stream ended.
+    clocks = [c for c in recorded if all(gap.length_s < LOST_S for gap in c.gaps)]
     if len(clocks) < 2:
         return
     middle, tick_s = (len(clocks) - 1) // 2, _tick_s(view)

@@ -28,15 +28,6 @@ FROZEN_S = 0.5
 # An outlier is so many times farther from its neighbours than 95 % of the entries are, and farther
 # than all others are apart.
 OUTLIER = 20.0
-# A clipped channel has this share of its readings at its end, and so many of them in a row.
-CLIPPED_SHARE, CLIPPED_RUN = 0.01, 5
-# It has so many times more readings at the end than at the value next to it.
-PILED_UP = 3
-# Least number of channels of a profile that are clipped: a bright echo is a few channels wide.
-TOGETHER = 3
-# A channel that begins at its end for so long rests there.
-REST_S = 0.5
-
 # Fewest entries for values to be judged.
 _FEWEST = 20
 _NEIGHBOURS = 5
@@ -285,13 +276,12 @@ def describe_channels(values: NDArray[np.floating], columns: Sequence[int]) -> N
 
 
 def find_channel_issues(view: EpisodeView) -> Iterator[Issue]:
-    """Issues of kind flat channel, still channel, frozen, saturated, action and state outlier."""
+    """Issues of kind flat channel, still channel, frozen, action and state outlier."""
     for name, stream in view.streams.items():
         if name != "poses" and len(stream.time) >= _FEWEST:
             yield from _unmoved(view, name, stream)
     if view.sensor is not None and len(view.sensor.time) >= _FEWEST:
         yield from _frozen(view, view.sensor)
-        yield from _saturated(view, view.sensor)
     if view.timeline is not None:
         yield from _outliers(view, "action", "tick", view.shown["action"])
     if view.state is not None:
@@ -364,48 +354,3 @@ def _outliers(view: EpisodeView, name: str, entry: str, stream: Stream) -> Itera
         message = f"{leap} ({entry} {worst}; {len(places)} such {entry}s); {rest}"
         stop = float(time[places[-1]]) + usual_step(time)
         yield view.issue(f"{name} outlier", name, message, float(time[places[0]]), stop)
-
-
-def _saturated(view: EpisodeView, sensor: Stream) -> Iterator[Issue]:
-    """Channels that are clipped at the end of their range that is farther from zero.
-
-    A force rests near zero, at the other end. The channels of a profile share one converter, and so
-    one range.
-    """
-    names, low, high = sensor.channels.names, sensor.values.min(axis=0), sensor.values.max(axis=0)
-    for group in group_channels(sensor.channels):
-        for columns in [group.indices] if group.profile else [[c] for c in group.indices]:
-            lower, upper = low[columns].min(), high[columns].max()
-            end, which = (upper, "upper") if abs(upper) >= abs(lower) else (lower, "lower")
-            if not (clipped := _clipped(sensor, columns, end)):
-                continue
-            places = np.flatnonzero((sensor.values[:, clipped] == end).any(axis=1))
-            message = (
-                f"{named(names, clipped)} ({len(clipped)} of {len(names)} channels) stand at the "
-                f"{which} end of their range, {end:g}, in "
-                f"{100 * len(places) / len(sensor.time):.1f} % of the readings"
-            )
-            yield view.issue("saturated", "sensor", message, *sensor.time[places[[0, -1]]].tolist())
-
-
-def _clipped(sensor: Stream, columns: Sequence[int], end: np.floating) -> list[int]:
-    """The columns that are at the end of their range, if enough of them are clipped there.
-
-    A clipped channel has far more readings at the end than at the value next to it, some in a row.
-    A channel of two values is a switch, and one that begins at its end rests there.
-    """
-    standing, clipped = list[int](), 0
-    for column in columns:
-        values = sensor.values[:, column]
-        at_end = values == end
-        if end == 0 or at_end.mean() < CLIPPED_SHARE or at_end.all():
-            continue
-        if len(columns) == 1 and at_end[sensor.time <= sensor.time[0] + REST_S].mean() >= 0.5:
-            continue
-        standing.append(column)
-        others = values[~at_end]
-        beside = np.count_nonzero(others == others[np.abs(others - end).argmin()])
-        in_a_row = max(stop - start for start, stop in runs(at_end)) >= CLIPPED_RUN
-        piled_up = np.count_nonzero(at_end) >= PILED_UP * beside
-        clipped += bool(others.min() < others.max() and in_a_row and piled_up)
-    return standing if clipped >= min(TOGETHER, len(columns)) else []

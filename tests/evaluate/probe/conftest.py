@@ -9,9 +9,8 @@ import pytest
 import zarr
 from sklearn.linear_model import Ridge
 
-from pipeline.evaluate.probe.folds import ProbeFolds
 from pipeline.evaluate.probe.inputs import LIMIT, STILL
-from pipeline.evaluate.probe.ridge import ProbeScore
+from pipeline.evaluate.probe.ridge import ProbeFolds, ProbeScore
 from pipeline.store import FeatureStore
 from pipeline.store.chunks import write_seal
 

@@ -52,15 +52,9 @@ def test_the_demos_random_weights_are_nothing_to_learn_from(
     assert "Qwen/Qwen2.5-VL-3B-Instruct" in here.remedy and "docs/real-model.md" in here.remedy
 
 
-def test_a_folder_with_a_hole(params: Make, demo_checkpoint: Path, tmp_path: Path) -> None:
-    broken = shutil.copytree(demo_checkpoint, tmp_path / "broken")
-    next(broken.glob("*.safetensors")).unlink()
-    (issue,) = check_checkpoint(params(broken))
-    assert issue.severity == "error"
-    assert str(broken) in issue.message
-
-
-def test_a_file_that_is_cut_off(params: Make, demo_checkpoint: Path, tmp_path: Path) -> None:
+def test_a_folder_with_a_hole_or_a_file_that_is_cut_off(
+    params: Make, demo_checkpoint: Path, tmp_path: Path
+) -> None:
     broken = shutil.copytree(demo_checkpoint, tmp_path / "broken")
     weights = next(broken.glob("*.safetensors"))
     whole = weights.read_bytes()
@@ -68,25 +62,22 @@ def test_a_file_that_is_cut_off(params: Make, demo_checkpoint: Path, tmp_path: P
         weights.write_bytes(kept)
         (issue,) = check_checkpoint(params(broken))
         assert (issue.severity, issue.remedy) == ("error", "copy it again")
-        assert f"{weights}: cut off or damaged: " in issue.message
+        assert str(weights) in issue.message
+    weights.unlink()
+    (issue,) = check_checkpoint(params(broken))
+    assert issue.severity == "error" and str(broken) in issue.message
 
 
-def test_what_is_not_here(params: Make) -> None:
+def test_what_is_not_here(params: Make, tmp_path: Path) -> None:
     (folder,) = check_checkpoint(params("/no/such/folder"))
     assert folder.severity == "error" and "no hub id" in folder.message
-    hub = params("Qwen/Qwen2.5-VL-3B-Instruct")
-    (fetched,) = check_checkpoint(hub)
-    assert fetched.severity == "note" and "first extraction downloads it" in fetched.message
+    (fetched,) = check_checkpoint(params("Qwen/Qwen2.5-VL-3B-Instruct"))
+    assert fetched.severity == "note"
     assert fetched.remedy == "hf download Qwen/Qwen2.5-VL-3B-Instruct"
-
-
-def test_the_demos_own_checkpoint_is_written_by_its_stage(params: Make, tmp_path: Path) -> None:
-    absent = tmp_path / "demo_vlm"
-    given = params(absent)
-    given = given.model_copy(update={"demo": given.demo.model_copy(update={"checkpoint": absent})})
-    (issue,) = check_checkpoint(given)
-    assert issue.severity == "error"
-    assert "stages.demo" in issue.remedy
+    given = params(tmp_path / "demo_vlm")
+    demo = given.demo.model_copy(update={"checkpoint": tmp_path / "demo_vlm"})
+    (issue,) = check_checkpoint(given.model_copy(update={"demo": demo}))
+    assert issue.severity == "error" and "stages.demo" in issue.remedy
 
 
 def test_an_adapter(tmp_path: Path) -> None:
@@ -106,7 +97,7 @@ def test_an_adapter(tmp_path: Path) -> None:
     ("dtype", "gpus", "available", "level"),
     [
         ("bfloat16", [24], 8, "ok"),
-        ("float32", [24], 8, "note"),
+        ("float32", [24], 64, "note"),
         ("bfloat16", [80, 8], 64, "note"),
         ("bfloat16", [], 16, "ok"),
         ("float32", [], 16, "note"),
@@ -118,5 +109,3 @@ def test_seven_billion_parameters_fit_or_not(
     found = [GPU(f"GPU {gib}", gib * GIB, True) for gib in gpus]
     issue = check_fit(7_000_000_000, params("a/b", dtype=dtype).vlm, found, available * GIB)
     assert issue.severity == level
-    if level == "note":
-        assert ("vlm.dtype to bfloat16" in issue.remedy) == (dtype == "float32")

@@ -39,16 +39,11 @@ def test_sources_are_counted_and_the_videos_codec_is_named(recordings: Path) -> 
 
 def test_what_is_not_there_is_missing(recordings: Path) -> None:
     (root,) = check_recordings(params(recordings / "nowhere", {"name": "a", "path": "a"}))
-    assert root.severity == "error" and "nowhere: no such folder" in root.message
+    assert root.severity == "error" and str(recordings / "nowhere") in root.message
     *_, source = check_recordings(params(recordings, {"name": "monday", "path": "2025-*"}))
     assert (source.severity, source.kind) == ("error", "monday")
-    assert "matches nothing" in source.message
-
-
-def test_the_demos_recordings_are_made_by_its_stage(tmp_path: Path) -> None:
-    given = params(Path("elsewhere"), {"name": "a", "path": "a"})
-    *_, issue = check_recordings(given)
-    assert "stages.demo" in issue.remedy
+    *_, demo = check_recordings(params(Path("elsewhere"), {"name": "a", "path": "a"}))
+    assert "stages.demo" in demo.remedy
 
 
 @pytest.mark.parametrize(("on_bad", "level"), [("stop", "error"), ("skip", "note")])

@@ -61,7 +61,6 @@ def test_gpus_that_are_seen() -> None:
         (True, "cuda", "auto", "ok"),
         (True, "cuda", "flash_attention_2", "ok"),
         (False, "cuda", "auto", "note"),
-        (False, "cpu", "auto", "ok"),
         (False, "cuda", "flash_attention_2", "error"),
         (True, "cpu", "flash_attention_2", "error"),
     ],

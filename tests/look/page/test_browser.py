@@ -3,14 +3,12 @@
 import json
 import time
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from pipeline.base.errors import Issue
-from pipeline.look.page.blocks import Issues, Report, Section, Text
+from pipeline.look.page.blocks import Report, Section, Text
 from pipeline.look.page.writing import write_report
 
 
@@ -18,13 +16,6 @@ def test_a_browser_finds_every_block_sound(
     every_page: Path, assert_page_is_sound: Callable[[Path], None]
 ) -> None:
     assert_page_is_sound(every_page)
-
-
-def test_an_empty_report_is_a_page(
-    tmp_path: Path, assert_page_is_sound: Callable[[Path], None], every_block: Report
-) -> None:
-    bare = replace(every_block, tiles=(), sections=[Section("Nothing", [])])
-    assert_page_is_sound(write_report(tmp_path, bare)[0])
 
 
 PLANTED = (
@@ -55,6 +46,7 @@ def test_a_page_that_asks_for_anything_is_not_sound(
         assert visit.trouble, planted
 
 
+@pytest.mark.slow
 def test_a_picture_opens_large_and_goes_back(every_page: Path, browser_page) -> None:
     page = browser_page(every_page).page
     small = page.locator("#picture-one svg").bounding_box()
@@ -81,30 +73,25 @@ Object.defineProperty(window, "kept", { value: kept });
 """
 
 
+@pytest.mark.slow
 def test_light_and_dark_can_be_chosen_and_are_remembered(
     every_page: Path, browser_page: Callable[..., Any]
 ) -> None:
-    page = every_page
-    first = browser_page(page, script=STORAGE % ("{}", ""))
+    chosen = "() => document.documentElement.dataset.theme"
+    first = browser_page(every_page, script=STORAGE % ("{}", ""))
     first.page.locator("#theme").click()
     kept = first.page.evaluate("() => kept")
-    assert kept == {f"theme:{page.resolve().as_posix()}": "dark"}
-    again = browser_page(page, script=STORAGE % (json.dumps(kept), ""))
-    assert again.page.evaluate("() => document.documentElement.dataset.theme") == "dark"
-    assert first.trouble == again.trouble == []
-
-
-def test_light_and_dark_can_be_chosen_where_nothing_may_be_stored(
-    every_page: Path, browser_page: Callable[..., Any]
-) -> None:
+    assert kept == {f"theme:{every_page.resolve().as_posix()}": "dark"}
+    again = browser_page(every_page, script=STORAGE % (json.dumps(kept), ""))
+    assert again.page.evaluate(chosen) == "dark"
     refused = "throw new DOMException('denied', 'SecurityError');"
-    visit = browser_page(every_page, script=STORAGE % ("{}", refused))
-    for chosen in ("dark", "light"):
-        visit.page.locator("#theme").click()
-        assert visit.page.evaluate("() => document.documentElement.dataset.theme") == chosen
-    assert visit.trouble == []
+    unkept = browser_page(every_page, script=STORAGE % ("{}", refused))
+    unkept.page.locator("#theme").click()
+    assert unkept.page.evaluate(chosen) == "dark", "also where nothing may be stored"
+    assert first.trouble == again.trouble == unkept.trouble == []
 
 
+@pytest.mark.slow
 def test_without_scripts_and_on_paper_all_is_there(
     every_page: Path, browser_page: Callable[..., Any]
 ) -> None:
@@ -118,6 +105,7 @@ def test_without_scripts_and_on_paper_all_is_there(
     assert drawn.pdf()[:5] == b"%PDF-"
 
 
+@pytest.mark.slow
 def test_the_contents_are_folded_on_a_phone_only(every_page: Path, browser_page) -> None:
     assert browser_page(every_page).page.locator("nav a").first.is_visible()
     phone = browser_page(every_page, (390, 844)).page
@@ -128,6 +116,7 @@ def test_the_contents_are_folded_on_a_phone_only(every_page: Path, browser_page)
     assert not phone.locator("nav a").first.is_visible()
 
 
+@pytest.mark.slow
 def test_the_contents_scroll_to_where_the_reader_is(
     tmp_path: Path, browser_page: Callable[..., Any]
 ) -> None:
@@ -138,20 +127,3 @@ def test_the_contents_scroll_to_where_the_reader_is(
     here.wait_for()
     box = here.bounding_box()
     assert 0 < box["y"] < 900
-
-
-def test_labels_of_tiles_end_at_one_height_and_a_cut_list_has_a_shade(
-    tmp_path: Path, browser_page: Callable[..., Any]
-) -> None:
-    gap = Issue(severity="warning", kind="gap", message="a gap there " * 9, stream="sensor")
-    found = Issues([replace(gap, episode=f"e{index}") for index in range(40)], "fine")
-    tiles = [("lowest held-out error [training std]", "0.1"), ("by", "a name that " * 4)]
-    report = Report("Tiles", "", tiles, [Section("All", [found])])
-    page = browser_page(write_report(tmp_path, report)[0], (390, 844)).page
-    labels = [one.bounding_box() for one in page.locator(".tiles dt").all()]
-    assert len({round(one["y"] + one["height"]) for one in labels}) == 1
-    page.locator("details.places > summary").click()
-    scroller = page.locator(".places > ul")
-    assert scroller.evaluate("one => one.scrollHeight > one.clientHeight")
-    shades = scroller.evaluate("one => getComputedStyle(one).backgroundAttachment")
-    assert shades == "local, local, scroll, scroll"

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from pipeline.evaluate.curves import TrainingCurve, TrainingCurves
+from pipeline.evaluate.sources import TrainingCurve, TrainingCurves
 from pipeline.look.evaluation import draw_curves
 from pipeline.look.page import style
 

@@ -13,7 +13,7 @@ from pipeline.look.recording.streams import contacts
 from pipeline.simulation.insertion import TICK_HZ
 from pipeline.simulation.recorder import SimulatedEpisode, simulate_episode
 
-SEEDS = range(20, 24)
+SEEDS = (20, 23)
 
 
 def depth_mm(episode: SimulatedEpisode, time_s: np.ndarray) -> np.ndarray:
@@ -91,24 +91,7 @@ def test_no_force_no_contact(base: EpisodeView) -> None:
     assert contacts(view) == []
 
 
-def test_a_silent_sensor_touches_nothing(base: EpisodeView) -> None:
+def test_a_silent_or_short_sensor_or_a_clock_that_repeats_touches_nothing(base) -> None:
     time = np.arange(100) / 10
-    assert contacts(view_of(base, time, np.zeros(100))) == []
-    assert contacts(view_of(base, time[:2], np.zeros(2))) == []
-
-
-def test_every_format_of_an_episode_has_the_same_contact(healthy: Path, look) -> None:
-    ends = []
-    for format in ("raw", "new", "lerobot"):
-        view = look(healthy / format)
-        assert view.timeline is not None
-        start, stop = contacts(view)[-1]
-        # The sensor's own clock differs by format in its beginning and jitter only.
-        ends.append(view.sensor.time[-1] - start)
-        assert stop == view.sensor.time[-1]
-    assert ends == pytest.approx([ends[0]] * 3, abs=0.05)
-
-
-def test_a_clock_that_only_repeats_has_no_contact_and_no_error(base: EpisodeView) -> None:
-    standing = view_of(base, np.full(100, 5.0), np.zeros(100))
-    assert contacts(standing) == []
+    for times in (time, time[:2], np.full(100, 5.0)):
+        assert contacts(view_of(base, times, np.zeros(len(times)))) == []

@@ -81,16 +81,6 @@ class TestCameras:
         assert (issue.kind, issue.stream, issue.start_s) == ("dead camera", "view View1", None)
         assert "are of one colour" in issue.message
 
-    def test_dead_for_a_while(self, copied: Copied, issues_of: Find) -> None:
-        folder = copied("raw")
-        dead = frames(folder, "View2")[20:50]
-        for path in dead:
-            Image.new("RGB", (224, 126), (90, 90, 90)).save(path)
-        (issue,) = issues_of(folder)
-        assert issue.start_s is not None and issue.stop_s is not None
-        assert time_of(dead[0]) <= issue.start_s < issue.stop_s <= time_of(dead[-1])
-        assert issue.stop_s - issue.start_s > 1
-
     def test_dead_for_a_while_among_noisy_frames(self, copied: Copied, issues_of: Find) -> None:
         """They are one picture too, which is not told of a second time."""
         folder = copied("raw")
@@ -99,30 +89,18 @@ class TestCameras:
             Image.new("RGB", (224, 126), (90, 90, 90)).save(path)
         assert [issue.kind for issue in issues_of(folder, views=["View2"])] == ["dead camera"]
 
-    @pytest.mark.parametrize("colour", [(0, 0, 0), (0, 135, 0)])
-    def test_dead_for_some_frames(
-        self, copied: Copied, issues_of: Find, colour: tuple[int, int, int]
-    ) -> None:
-        folder = copied("raw")
-        dead = frames(folder, "View1")[7:11]
-        for path in dead:
-            Image.new("RGB", (224, 126), colour).save(path)
-        (issue,) = issues_of(folder, vlm_reuse_count=1)
-        assert (issue.kind, issue.stream) == ("dead camera", "view View1")
-        assert (issue.start_s, issue.stop_s) == (time_of(dead[0]), time_of(dead[-1]))
-        # A VL row serves three ticks, and of the frames between two rows nothing is said.
-        assert [one.kind for one in issues_of(folder)] == ["dead camera"]
-
     def test_dead_twice(self, copied: Copied, issues_of: Find) -> None:
         folder = copied("raw")
         paths = frames(folder, "View2")
         for path in (*paths[7:12], *paths[40:50]):
-            Image.new("RGB", (224, 126)).save(path)
+            Image.new("RGB", (224, 126), (0, 135, 0)).save(path)
         found = issues_of(folder, vlm_reuse_count=1)
         assert [(issue.kind, issue.start_s, issue.stop_s) for issue in found] == [
             ("dead camera", time_of(paths[7]), time_of(paths[11])),
             ("dead camera", time_of(paths[40]), time_of(paths[49])),
         ]
+        # A VL row serves three ticks, and of the frames between two rows nothing is said.
+        assert {one.kind for one in issues_of(folder)} == {"dead camera"}
 
     def test_frozen_while_the_others_move(self, copied: Copied, issues_of: Find) -> None:
         folder = copied("raw")
@@ -143,12 +121,8 @@ class TestCameras:
         for path in frozen[1:]:
             path.write_bytes(frozen[0].read_bytes())
         (issue,) = issues_of(folder, views=["View1"])
-        assert (issue.kind, issue.start_s, issue.stop_s) == (
-            "duplicate frames",
-            time_of(frozen[0]),
-            time_of(frozen[-1]),
-        )
-        assert "frames 30 to 33 are one picture" in issue.message
+        assert issue.kind == "duplicate frames" and "frames 30 to 33" in issue.message
+        assert (issue.start_s, issue.stop_s) == (time_of(frozen[0]), time_of(frozen[-1]))
 
     def test_every_second_frame_twice(self, copied: Copied, issues_of: Find) -> None:
         folder = copied("raw")
@@ -213,12 +187,9 @@ class TestCameras:
         assert (issue.kind, issue.stream) == ("missing", "cameras")
         assert issue.message == "no camera has a frame: the VLM would see no picture"
 
-    @pytest.mark.parametrize(("format", "place"), [("raw", ""), ("new", "images")])
-    def test_a_folder_without_a_frame(
-        self, copied: Copied, issues_of: Find, format: str, place: str
-    ) -> None:
-        folder = copied(format)
-        (folder / place / "View3" / "left").mkdir(parents=True)
+    def test_a_folder_without_a_frame(self, copied: Copied, issues_of: Find) -> None:
+        folder = copied("new")
+        (folder / "images" / "View3" / "left").mkdir(parents=True)
         (issue,) = issues_of(folder)
         assert (issue.kind, issue.stream) == ("missing", "view View3")
         assert issues_of(folder, views=["View1"]) == ()
@@ -226,7 +197,6 @@ class TestCameras:
     @pytest.mark.parametrize(
         ("format", "file", "stream", "said"),
         [
-            ("new", "robot_states.csv", "state", "metadata.json says robot_states_count "),
             ("new", "sensor_data.npz", "sensor", "metadata.json says sensor_windows_count "),
             ("old", "robot_states.npz", "state", "data.pkl's metadata says num_robot_states "),
         ],
@@ -266,15 +236,6 @@ class TestCameras:
         assert (issue.kind, issue.severity, issue.stream) == ("depth view", "warning", "view View2")
         assert issues_of(root, views=["View1"]) == ()
 
-    def test_frames_counted_in_words(self, copied: Copied) -> None:
-        """Then it is no recording, and is told with those that cannot be read."""
-        folder = copied("new")
-        metadata(folder, camera_frames_count="many")
-        opened = open_recordings([Source(name="s", path=str(folder))], views=None)
-        (bad,) = opened.bad
-        said = f"{folder / 'metadata.json'}: camera_frames_count: expected a valid integer"
-        assert opened.recordings == () and said in bad.reason and "'many'" in bad.reason
-
     def test_frames_lost_one_by_one(self, copied: Copied, issues_of: Find) -> None:
         folder = copied("raw")
         paths = frames(folder, "View2")
@@ -309,38 +270,6 @@ class TestClocks:
         )
         assert f"no entry for {time[300] - time[199]:.2f} s" in issue.message
 
-    def test_a_gap_of_a_camera(self, copied: Copied, issues_of: Find) -> None:
-        folder = copied("raw")
-        gone = frames(folder, "View2")[30:40]
-        for path in gone:
-            path.unlink()
-        kinds = {issue.kind: issue for issue in issues_of(folder)}
-        assert "gap" in kinds and kinds["gap"].stream == "view View2"
-        assert kinds["gap"].start_s == pytest.approx(time_of(gone[0]), abs=0.2)
-
-    def test_each_of_many_gaps_has_its_time(
-        self, copied: Copied, issues_of: Find, change_csv
-    ) -> None:
-        folder = copied("raw")
-        holes = np.concatenate([np.arange(50 * i, 50 * i + 15) for i in range(1, 12)])
-        change_csv(only(folder, "robot_state_*.csv"), lambda table: np.delete(table, holes, axis=0))
-        found = [issue for issue in issues_of(folder) if issue.kind == "gap"]
-        assert len(found) == 11
-        assert len({issue.start_s for issue in found}) == 11
-
-    def test_a_jump(self, copied: Copied, issues_of: Find, change_csv) -> None:
-        folder = copied("raw")
-
-        def jump(table: np.ndarray) -> np.ndarray:
-            table[400:, 1] += 3600
-            return table
-
-        change_csv(only(folder, "robot_state_*.csv"), jump)
-        issue = next(issue for issue in issues_of(folder) if issue.kind == "clock jump")
-        assert issue.start_s is not None and issue.stop_s is not None
-        assert issue.stop_s - issue.start_s == pytest.approx(3600, abs=0.1)
-        assert "jumps by 3600.0" in issue.message
-
     def test_another_rate_than_fps(self, copied: Copied, issues_of: Find) -> None:
         root = copied("lerobot")
         info = json.loads((root / "meta/info.json").read_text())
@@ -350,20 +279,16 @@ class TestClocks:
 
     def test_ticks_lost_at_both_ends(self, copied: Copied, issues_of: Find, change_npz) -> None:
         folder = copied("raw")
-        sensor = only(folder, "sensor_data_*.npz")
-        with np.load(sensor) as archive:
-            members = {name: archive[name][1300:] for name in archive.files}
-        np.savez(sensor, **members)
+        names = ("timestamps", "forces", "alines")
+        change_npz(only(folder, "sensor_data_*.npz"), **dict.fromkeys(names, lambda v: v[1300:]))
         for path in frames(folder, "View5")[-15:]:
             path.unlink()
         found = {issue.stream: issue for issue in issues_of(folder) if issue.kind == "lost ticks"}
         assert set(found) == {"sensor", "view View5"}
-        late, early = found["sensor"], found["view View5"]
-        assert late.start_s is not None and late.stop_s == members["timestamps"][0]
-        assert late.stop_s - late.start_s == pytest.approx(2, abs=0.2)
-        assert early.start_s is not None and early.stop_s is not None
-        assert early.stop_s - early.start_s == pytest.approx(1.5, abs=0.2)
-        assert "begins 1.9" in late.message and "ends 1." in early.message
+        for stream, said, lost_s in (("sensor", "begins 1.9", 2), ("view View5", "ends 1.", 1.5)):
+            issue = found[stream]
+            assert said in issue.message and issue.start_s is not None and issue.stop_s is not None
+            assert issue.stop_s - issue.start_s == pytest.approx(lost_s, abs=0.2)
 
 
 class TestChannels:
@@ -381,18 +306,6 @@ class TestChannels:
         assert (
             "65 of 1026 channels never change: aline_0100–aline_0163, aline_0500" in issue.message
         )
-
-    def test_a_joint_that_never_moves(self, copied: Copied, issues_of: Find, change_csv) -> None:
-        folder = copied("raw")
-
-        def hold(table: np.ndarray) -> np.ndarray:
-            table[:, 6] = 12.5
-            return table
-
-        change_csv(only(folder, "robot_state_*.csv"), hold)
-        (issue,) = issues_of(folder)
-        assert issue.message == "1 of 12 channels never change: joint_3"
-        assert issue.start_s is None
 
     def test_a_joint_that_hardly_moves(self, copied: Copied, issues_of: Find, change_csv) -> None:
         folder = copied("raw")

@@ -1,4 +1,4 @@
-"""The frames of a report are those of the recording that the store was made from, or none."""
+"""Curves of a training and frames of recordings are those of the policy and store, or none."""
 
 import shutil
 from collections.abc import Callable, Sequence
@@ -8,11 +8,17 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from pipeline.base.config import Source
+from pipeline.base.config import Source, TrainHeadParams
 from pipeline.base.digests import file_digest
 from pipeline.data import Recording, content_digest, open_recordings
 from pipeline.data.timeline import Timeline, build_timeline
-from pipeline.evaluate.episode_frames import EpisodeFrames, read_episode_frames, shown_ticks
+from pipeline.evaluate.sources import (
+    EpisodeFrames,
+    TrainingCurves,
+    read_episode_frames,
+    shown_ticks,
+)
+from pipeline.evaluate.sources import read_curves as curves_of
 from pipeline.simulation.insertion_formats import (
     ABUTTING,
     write_lerobot,
@@ -22,6 +28,53 @@ from pipeline.simulation.insertion_formats import (
 )
 from pipeline.simulation.recorder import simulate_episode
 from pipeline.store import FeatureStore
+
+
+def read_curves(logs: Path, step: int = 20, **metrics: float) -> TrainingCurves:
+    """Of a checkpoint of that step, with this error where one is given."""
+    named = {name.replace("_", "/"): value for name, value in metrics.items()}
+    checkpoint = SimpleNamespace(params=TrainHeadParams(logs=logs), step=step, metrics=named)
+    return curves_of(checkpoint)  # type: ignore[arg-type]
+
+
+def written(logs: Path, name: str, text: str) -> None:
+    """One curve as dvclive writes it."""
+    file = logs / f"plots/metrics/{name}.tsv"
+    file.parent.mkdir(parents=True, exist_ok=True)
+    file.write_text(text)
+
+
+def test_every_curve_is_read_under_its_name(tmp_path: Path) -> None:
+    written(tmp_path, "train/loss", "step\tloss\n10\t0.5\n20\t0.25\n")
+    written(tmp_path, "val/error", "step\terror\n20\t9e-1\n")
+    written(tmp_path, "lr", "step\tlr\n")
+    found = read_curves(tmp_path, val_error=0.9)
+    points = {n: (c.step.tolist(), c.value.tolist()) for n, c in found.curves.items()}
+    assert points == {"train/loss": ([10, 20], [0.5, 0.25]), "val/error": ([20], [0.9])}
+    assert found.absence == ""
+
+
+def test_logs_that_are_gone_empty_or_torn_are_said(tmp_path: Path) -> None:
+    found = read_curves(tmp_path / "logs")
+    assert found.curves == {} and str(tmp_path / "logs") in found.absence
+    for content in ("step\tloss\n", "step\tloss\n10\n", "step\tloss\n10\tmuch\n"):
+        written(tmp_path, "train/loss", content)
+        found = read_curves(tmp_path)
+        assert found.curves == {} and str(tmp_path) in found.absence
+
+
+def test_curves_of_another_training_are_not_shown(tmp_path: Path) -> None:
+    written(tmp_path, "val/error", "step\terror\n10\t0.5\n20\t0.25\n")
+    assert read_curves(tmp_path, 10, val_error=0.5).curves
+    assert read_curves(tmp_path, 10).curves, "a last checkpoint has no error of its own"
+    for other in (
+        read_curves(tmp_path, 30),
+        read_curves(tmp_path, 15, val_error=0.5),
+        read_curves(tmp_path, 20, val_error=0.5),
+    ):
+        assert other.curves == {}
+        assert "are of another training" in other.absence
+
 
 FORMATS = ("raw", "new", "old", "lerobot")
 REUSE = 3
@@ -91,31 +144,19 @@ def test_frames_are_those_that_the_rows_were_made_of(recorded_demo: Path, format
     assert (first != last).any()
 
 
-def test_only_the_views_of_the_store_are_shown(recorded_demo: Path) -> None:
-    one = stored(recorded_demo, "lerobot", ("View2",))
-    found = one.frames([2], recorded_demo)
-    assert (list(found.frames), found.absence) == (["View2"], "")
-    np.testing.assert_array_equal(found.frames["View2"][0], expected(one, "View2", [2])[0])
-
-
-def a_file(one: Stored) -> Path:
-    """One of the episode's own files that hold no frame."""
-    return next(
-        file for file in one.recording.files() if file.suffix in (".npz", ".pkl", ".csv", ".txt")
-    )
-
-
 @pytest.mark.parametrize("format", ["raw", "lerobot"])
-def test_a_changed_recording_shows_nothing(root: Path, format: str) -> None:
+def test_a_recording_that_changed_or_is_gone_shows_nothing(root: Path, format: str) -> None:
     one = stored(root, format)
-    file = a_file(one)
+    kinds = (".npz", ".pkl", ".csv", ".txt")
+    file = next(file for file in one.recording.files() if file.suffix in kinds)
     file.write_bytes(file.read_bytes() + b"\n")
     found = one.frames([0], root)
     assert found.frames == {}
-    assert found.absence == (
-        f"No frames: the recording at {root / one.episode.path} changed since the store was made "
-        "from it."
-    )
+    assert f"{root / one.episode.path} changed since" in found.absence
+    shutil.rmtree(one.recording.path)
+    found = one.frames([0], root)
+    assert found.frames == {}
+    assert f"no recording at {root / one.episode.path} any more" in found.absence
 
 
 def test_another_frame_under_the_same_name_is_not_shown(root: Path) -> None:
@@ -123,15 +164,6 @@ def test_another_frame_under_the_same_name_is_not_shown(root: Path) -> None:
     first, second, *_ = [file for file in one.recording.files() if file.suffix == ".jpg"]
     shutil.copyfile(second, first)
     assert one.frames([0], root).frames == {}
-
-
-@pytest.mark.parametrize("format", ["new", "lerobot"])
-def test_a_recording_that_is_gone_is_said(root: Path, format: str) -> None:
-    one = stored(root, format)
-    shutil.rmtree(one.recording.path)
-    found = one.frames([0], root)
-    assert found.frames == {}
-    assert f"no recording at {root / one.episode.path} any more" in found.absence
 
 
 @pytest.mark.parametrize(
@@ -148,9 +180,7 @@ def test_what_cannot_be_read_is_said_in_one_sentence(
     spoil(one.recording.path)
     found = one.frames([0], root)
     assert found.frames == {}
-    assert found.absence.startswith(
-        f"No frames: the recording at {one.recording.path} cannot be read ("
-    )
+    assert f"{one.recording.path} cannot be read (" in found.absence
     assert "\n" not in found.absence
 
 
@@ -162,16 +192,17 @@ def test_a_time_between_two_frames_belongs_to_neither(recorded_demo: Path) -> No
     assert "View2 has no frames at the times that the store has" in found.absence
 
 
-def test_a_view_that_the_episode_lacks_is_left_out(recorded_demo: Path) -> None:
+def test_views_that_store_or_episode_lacks_are_left_out(recorded_demo: Path) -> None:
+    one = stored(recorded_demo, "lerobot", ("View2",))
+    found = one.frames([2], recorded_demo)
+    assert list(found.frames) == ["View2"]
+    np.testing.assert_array_equal(found.frames["View2"][0], expected(one, "View2", [2])[0])
     one = stored(recorded_demo, "raw")
     one.store.array("vl/frame_time")[:, 0] = np.nan
     assert list(one.frames([0, 1], recorded_demo).frames) == ["View2", "View5"]
 
 
 def test_ticks_are_shown_where_their_frames_are_newest(store: FeatureStore) -> None:
-    ticks = np.arange(31, 60)
-    found = shown_ticks(store, ticks, 4)
-    assert found.tolist() == [33, 42, 48, 57]
-    assert (found % REUSE == 0).all()
+    assert shown_ticks(store, np.arange(31, 60), 4).tolist() == [33, 42, 48, 57]
     assert shown_ticks(store, np.array([31, 32]), 4).tolist() == [31, 32]
     assert shown_ticks(store, np.arange(30), 1).tolist() == [0]
