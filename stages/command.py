@@ -34,6 +34,9 @@ class Shorthand:
     nargs: str | None = None
     """As in argparse: `"*"` takes a list; with `"?"` the value may be left out and is then true."""
 
+    repeated: bool = False
+    """Whether commands that a message advises to run next need it, too."""
+
     def add_to(self, parser: argparse.ArgumentParser) -> None:
         """Add it to the parser."""
         text = f"{self.help} (--set {self.key}=…)"
@@ -53,6 +56,37 @@ class Shorthand:
         # A plain word stays as typed, so that 8 is a number; YAML must not interpret other text.
         word = isinstance(value, str) and re.fullmatch(r"[\w.+-]+", value)
         return [f"{self.key}={value if word else json.dumps(value)}"]
+
+
+_SHORT = {
+    "--data": ("root", "the folder of the recordings", "FOLDER"),
+    "--views": ("views", "the cameras to use", "VIEW"),
+    "--store": ("store", "the store", "FOLDER"),
+    "--checkpoint": ("checkpoint", "a trained policy", "FOLDER"),
+    "--expert": ("model_type", "regression, diffusion or flow_matching", "NAME"),
+    "--lr": ("lr", "learning rate", "RATE"),
+    "--steps": ("max_steps", "optimizer steps", "N"),
+    "--batch": ("batch_size", "samples or rows at a time", "N"),
+    "--device": ("device", "auto, cpu or cuda:N", "NAME"),
+    "--out": ("output", "the folder to write", "FOLDER"),
+}
+"""Options that several commands have: the key in the command's section, and its help."""
+
+
+def short(section: str, *options: str) -> tuple[Shorthand, ...]:
+    """Options for the keys of a section that people set most often."""
+    return tuple(
+        Shorthand(
+            option,
+            f"{section}.{key}",
+            text,
+            value,
+            "+" if option == "--views" else None,
+            repeated=True,
+        )
+        for option in options
+        for key, text, value in [_SHORT[option]]
+    )
 
 
 def run(
@@ -98,9 +132,10 @@ def _run(
         if options.keys:
             print("\n".join(described_keys(sections or tuple(Params.model_fields))))
         else:
-            short = (pair for shorthand in shorthands for pair in shorthand.override(options))
-            params = load_params(options.params, [*options.overrides, *short])
-            with running_with(options.params, options.overrides):
+            given = [(short, pair) for short in shorthands for pair in short.override(options)]
+            params = load_params(options.params, [*options.overrides, *(pair for _, pair in given)])
+            repeated = [pair for short, pair in given if short.repeated]
+            with running_with(options.params, [*options.overrides, *repeated]):
                 work(params)
         sys.stdout.flush()  # here, where an error is handled: at the interpreter's exit it is not
     except PipelineError as error:

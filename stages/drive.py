@@ -17,13 +17,14 @@ Next: python -m stages.inspect runs
 from functools import partial
 from typing import TYPE_CHECKING
 
-from stages.command import Shorthand, run
+from stages.command import Shorthand, run, short
 
 if TYPE_CHECKING:
     from pipeline.base.config import Params
 
 SECTIONS = ("drive",)
 SHORTHANDS = (
+    *short("drive", "--checkpoint", "--device"),
     Shorthand("--robot", "drive.robot", "module:Class or lerobot:TYPE", "NAME"),
     Shorthand("--server", "drive.server", "address of a running stages.serve", "URL"),
     Shorthand("--instruction", "drive.instruction", "what the robot is to do", "TEXT"),

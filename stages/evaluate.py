@@ -13,7 +13,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from stages.command import run
+from stages.command import run, short
 
 if TYPE_CHECKING:
     from pipeline.base.config import Params
@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from pipeline.store import FeatureStore
 
 SECTIONS = ("evaluate",)
+SHORTHANDS = short("evaluate", "--checkpoint", "--store", "--out", "--device")
 
 
 def main(params: "Params") -> None:
@@ -93,4 +94,4 @@ def _write(folder: Path, evaluation: "Evaluation", rollouts: str) -> list[Path]:
 
 
 if __name__ == "__main__":
-    raise SystemExit(run(__doc__ or "", main, sections=SECTIONS))
+    raise SystemExit(run(__doc__ or "", main, shorthands=SHORTHANDS, sections=SECTIONS))

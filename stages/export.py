@@ -13,12 +13,13 @@ earlier files stay.
 from functools import partial
 from typing import TYPE_CHECKING
 
-from stages.command import run
+from stages.command import run, short
 
 if TYPE_CHECKING:
     from pipeline.base.config import Params
 
 SECTIONS = ("export",)
+SHORTHANDS = short("export", "--checkpoint", "--out")
 
 
 def main(params: "Params") -> None:
@@ -39,4 +40,4 @@ def main(params: "Params") -> None:
 
 
 if __name__ == "__main__":
-    raise SystemExit(run(__doc__ or "", main, sections=SECTIONS))
+    raise SystemExit(run(__doc__ or "", main, shorthands=SHORTHANDS, sections=SECTIONS))

@@ -26,12 +26,17 @@ Next: python -m stages.inspect STORE (look at it), stages.train_head (train). do
 
 from typing import TYPE_CHECKING
 
-from stages.command import run
+from stages.command import Shorthand, run, short
 
 if TYPE_CHECKING:
     from pipeline.base.config import Params
 
 SECTIONS = ("data", "vlm", "extract")
+SHORTHANDS = (
+    *short("data", "--data", "--views"),
+    *short("extract", "--store", "--batch", "--device"),
+    Shorthand("--plan", "extract.plan", "say what would be computed, and why; compute nothing"),
+)
 
 
 def main(params: "Params") -> None:
@@ -55,4 +60,4 @@ def main(params: "Params") -> None:
 
 
 if __name__ == "__main__":
-    raise SystemExit(run(__doc__ or "", main, sections=SECTIONS))
+    raise SystemExit(run(__doc__ or "", main, shorthands=SHORTHANDS, sections=SECTIONS))

@@ -19,12 +19,13 @@ command continues from the last checkpoint. At its end it prints what to run nex
 
 from typing import TYPE_CHECKING
 
-from stages.command import run
+from stages.command import run, short
 
 if TYPE_CHECKING:
     from pipeline.base.config import Params
 
 SECTIONS = ("finetune", "train_head")
+SHORTHANDS = short("finetune", "--lr", "--steps", "--batch", "--out")
 
 
 def main(params: "Params") -> None:
@@ -66,4 +67,4 @@ def main(params: "Params") -> None:
 
 
 if __name__ == "__main__":
-    raise SystemExit(run(__doc__ or "", main, sections=SECTIONS))
+    raise SystemExit(run(__doc__ or "", main, shorthands=SHORTHANDS, sections=SECTIONS))

@@ -20,7 +20,7 @@ again replaces the page, its pictures and findings.csv there, and touches no oth
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
-from stages.command import Shorthand, run
+from stages.command import Shorthand, run, short
 
 if TYPE_CHECKING:
     from pipeline.base.config import Params
@@ -29,6 +29,8 @@ if TYPE_CHECKING:
 
 SECTIONS = ("inspect", "data")
 SHORTHANDS = (
+    *short("data", "--views"),
+    *short("inspect", "--out"),
     Shorthand(
         "path", "inspect.path", "recordings, folders or globs of them, or a store", "PATH", "*"
     ),

@@ -18,12 +18,13 @@ Next: set vlm.pooling to that line, then python -m stages.extract
 
 from typing import TYPE_CHECKING
 
-from stages.command import run
+from stages.command import run, short
 
 if TYPE_CHECKING:
     from pipeline.base.config import Params
 
 SECTIONS = ("probe",)
+SHORTHANDS = short("probe", "--store", "--out")
 
 
 def main(params: "Params") -> None:
@@ -54,4 +55,4 @@ def main(params: "Params") -> None:
 
 
 if __name__ == "__main__":
-    raise SystemExit(run(__doc__ or "", main, sections=SECTIONS))
+    raise SystemExit(run(__doc__ or "", main, shorthands=SHORTHANDS, sections=SECTIONS))

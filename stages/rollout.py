@@ -21,13 +21,14 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from stages.command import run
+from stages.command import run, short
 
 if TYPE_CHECKING:
     from pipeline.base.config import Params, RolloutParams
     from pipeline.evaluate.rollouts import Rollouts
 
 SECTIONS = ("rollout",)
+SHORTHANDS = short("rollout", "--checkpoint", "--out", "--device")
 
 
 def main(params: "Params") -> None:
@@ -119,4 +120,4 @@ def _write(folder: Path, rollouts: "Rollouts") -> list[Path]:
 
 
 if __name__ == "__main__":
-    raise SystemExit(run(__doc__ or "", main, sections=SECTIONS))
+    raise SystemExit(run(__doc__ or "", main, shorthands=SHORTHANDS, sections=SECTIONS))

@@ -18,12 +18,13 @@ from contextlib import closing
 from functools import partial
 from typing import TYPE_CHECKING
 
-from stages.command import run
+from stages.command import run, short
 
 if TYPE_CHECKING:
     from pipeline.base.config import Params
 
 SECTIONS = ("serve",)
+SHORTHANDS = short("serve", "--checkpoint", "--device")
 
 
 def main(params: "Params") -> None:
@@ -52,4 +53,4 @@ def main(params: "Params") -> None:
 
 
 if __name__ == "__main__":
-    raise SystemExit(run(__doc__ or "", main, sections=SECTIONS))
+    raise SystemExit(run(__doc__ or "", main, shorthands=SHORTHANDS, sections=SECTIONS))

@@ -6,7 +6,7 @@ train_head.split says which groups of episodes choose the checkpoint (val) and w
 stages.evaluate (test).
 
   python -m stages.train_head                                      what params.yaml says
-  python -m stages.train_head --set train_head.model_type=diffusion    or regression, flow_matching
+  python -m stages.train_head --expert diffusion --steps 2000      or regression, flow_matching
   python -m stages.train_head --set 'train_head.loggers=[tensorboard]'        or wandb, or both
   torchrun --nproc_per_node 2 -m stages.train_head                 on two GPUs: the same curve
 
@@ -23,12 +23,15 @@ Next: python -m stages.evaluate
 
 from typing import TYPE_CHECKING
 
-from stages.command import run
+from stages.command import run, short
 
 if TYPE_CHECKING:
     from pipeline.base.config import Params
 
 SECTIONS = ("train_head",)
+SHORTHANDS = short(
+    "train_head", "--expert", "--lr", "--steps", "--batch", "--store", "--out", "--device"
+)
 
 
 def main(params: "Params") -> None:
@@ -73,4 +76,4 @@ def _train(params: "Params") -> None:
 
 
 if __name__ == "__main__":
-    raise SystemExit(run(__doc__ or "", main, sections=SECTIONS))
+    raise SystemExit(run(__doc__ or "", main, shorthands=SHORTHANDS, sections=SECTIONS))

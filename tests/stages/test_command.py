@@ -11,9 +11,10 @@ from pathlib import Path
 import pytest
 
 import stages.__main__
+from pipeline.base.commands import command as advised
 from pipeline.base.errors import RecordingError
 from stages import command
-from stages.command import Shorthand, run
+from stages.command import Shorthand, run, short
 
 ROOT = Path(__file__).resolve().parents[2]
 PARAMS = str(ROOT / "params.yaml")
@@ -75,6 +76,20 @@ def test_shorthands_stand_for_a_set(capsys):
     assert seen[0].data.action_hz == 5
     assert run("Summary.", print, ["--params", PARAMS, "--reextract", "-1"], SHORTHANDS) == 2
     assert "verify.reextract: expected greater" in capsys.readouterr().err
+
+
+def test_short_options_set_keys_and_are_repeated_in_what_a_message_advises():
+    seen = []
+
+    def work(params):
+        seen.append((params.train_head.lr, params.data.views, advised("evaluate")))
+
+    options = (*short("train_head", "--lr"), *short("data", "--views"))
+    arguments = ["--params", PARAMS, "--lr", "1e-3", "--views", "View1", "View2"]
+    assert run("Summary.", work, arguments, options) == 0
+    ((lr, views, printed),) = seen
+    assert (lr, views) == (1e-3, ("View1", "View2"))
+    assert "--set train_head.lr=1e-3" in printed and "data.views" in printed
 
 
 def test_keys_are_listed_with_defaults_and_meaning(capsys):
