@@ -122,11 +122,18 @@ class PolicyDocument(SourceDocument):
             if actual not in fitting:
                 any_of = " or ".join(sorted(map(shown, fitting)))
                 raise ValueError(f"{place}: expected {any_of}, found {shown(actual)}")
-        for anchor in shape.anchors:
+        for anchor in (*shape.anchors, *shape.relative):
             pairs = ((anchor.action, shape.action_dim), (anchor.state, shape.state_dim))
             if any(channel >= size for channels, size in pairs for channel in channels):
                 raise ValueError(f"shape.anchors: expected channels that are there, found {anchor}")
-        for stream, size in shape.channels.items():
+        if bool(shape.relative) != (self.normalization.relative is not None):
+            raise ValueError(
+                "normalization.relative: expected it just where shape.relative has some"
+            )
+        sizes = shape.channels
+        if shape.relative:
+            sizes["relative"] = sizes["action"]
+        for stream, size in sizes.items():
             fitted = getattr(self.normalization, stream)
             actual = fitted and (fitted.mean.shape, fitted.std.shape)
             if actual != (size, size) and not (fitted is None and 0 in size):

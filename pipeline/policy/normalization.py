@@ -99,6 +99,8 @@ class Normalization:
     features: ChannelStatistics | None = None
     sensor: ChannelStatistics | None = None
     state: ChannelStatistics | None = None
+    relative: ChannelStatistics | None = None
+    """Of chunks with channels relative to the state; None where the policy learns none."""
 
     def document(self) -> dict[str, Any]:
         """All statistics as JSON values."""

@@ -38,7 +38,7 @@ from pipeline.policy.observation import (
     stream_of,
 )
 from pipeline.policy.regression import RegressionActionExpert
-from pipeline.policy.robot_state import Anchoring, expand
+from pipeline.policy.robot_state import Anchoring, RelativeActions, expand
 from pipeline.policy.shape import PolicyShape
 
 EXPERTS: dict[str, type[ActionExpert]] = {
@@ -139,11 +139,12 @@ class Policy(Trainable):
         self.normalizers = nn.ModuleDict(
             {name: Normalizer(getattr(normalization, name)) for name in self.encoders}
         )
-        self.action_normalizer = Normalizer(normalization.action)
+        self.action_normalizer = Normalizer(normalization.relative or normalization.action)
         expert = params.expert
         self.fusion = build_fusion(params.fusion_strategy, tokens, expert.dim, expert.heads)
         self.expert = build_expert(params, shape)
         self.anchoring = Anchoring(shape.anchors, shape.kinds)
+        self.relative = RelativeActions(shape.relative, shape.kinds)
         self.drop_rates = {name: float(getattr(params, f"drop_{name}")) for name in self.encoders}
 
     @property
@@ -177,9 +178,14 @@ class Policy(Trainable):
         validity = self._validity(observation)
         if self.training and any(self.drop_rates.values()):
             validity = drop_streams(validity, self.drop_rates, generator)
-        target = self.action_normalizer.normalize(self.anchoring.from_frame(action, observation))
+        target = self._learned(action, observation)
         context = self.context(observation, validity)
         return self.expert.loss(context, target, action_valid, generator)
+
+    def _learned(self, action: Chunk, observation: Observation) -> Chunk:
+        """Physical chunks as the expert learns them: their origins moved, normalised."""
+        moved = self.relative.from_absolute(action, observation)
+        return self.action_normalizer.normalize(self.anchoring.from_frame(moved, observation))
 
     @torch.inference_mode(False)  # guidance differentiates, which inference mode forbids
     @torch.no_grad()
@@ -198,12 +204,12 @@ class Policy(Trainable):
         context = self.context(observation)
         repeats = samples if self.stochastic else 1
         if guide is not None:
-            anchored = self.anchoring.from_frame(guide.chunk, observation)
-            normalised = self.action_normalizer.normalize(anchored)
-            guide = Guide(normalised, guide.weight).repeat(repeats)
+            learned = self._learned(guide.chunk, observation)
+            guide = Guide(learned, guide.weight).repeat(repeats)
         chunks = self.expert.act(context.repeat(repeats, 1, 1), generator, guide)
         physical = self.action_normalizer.invert(chunks).unflatten(0, (repeats, context.shape[0]))
         physical = self.anchoring.from_tick(physical, observation)
+        physical = self.relative.to_absolute(physical, observation)
         return physical.expand(samples, -1, -1, -1)
 
     def observe(

@@ -89,6 +89,51 @@ class Anchoring:
         return torch.cat([torch.stack(first, dim=-1).unsqueeze(-2), chunks[..., 1:, :]], dim=-2)
 
 
+@dataclass(frozen=True)
+class RelativeActions:
+    """Absolute chunks as differences from the state at the tick, and back, in physical units.
+
+    Every step counts from the same state. Angles go the short way round. The three angles of a
+    pose become the rotation vector, in degrees, of R(action)·R(state)ᵀ. A sample without a state
+    gives NaN, which stops a robot.
+    """
+
+    channels: Sequence[Anchor]
+    kinds: Sequence[Kind]
+
+    def from_absolute(self, chunks: Chunks, seen: Observation) -> Chunks:
+        """What the policy learns."""
+        return self._moved(chunks, seen, back=False)
+
+    def to_absolute(self, chunks: Chunks, seen: Observation) -> Chunks:
+        """The inverse of `from_absolute`: what the robot executes."""
+        return self._moved(chunks, seen, back=True)
+
+    def _moved(self, chunks: Chunks, seen: Observation, back: bool) -> Chunks:
+        if not self.channels:
+            return chunks
+        known = (seen.state_valid > 0).unsqueeze(1)
+        now = torch.where(known, seen.state[:, -1].float(), torch.nan).unsqueeze(1)
+        columns = list(chunks.float().unbind(-1))
+        for channel in self.channels:
+            places = list(channel.state)
+            own = torch.stack([columns[action] for action in channel.action], dim=-1)
+            here = now[..., places]
+            if channel.composed:
+                turn = rotation_matrix(here.deg2rad())
+                if back:
+                    own = pose_angles(_matrix(own.deg2rad()) @ turn).rad2deg()
+                else:
+                    own = _vector(rotation_matrix(own.deg2rad()) @ turn.mT).rad2deg()
+            elif back:
+                own = own + here
+            else:
+                own = _difference(own, here, [self.kinds[place] for place in places])
+            for action, values in zip(channel.action, own.unbind(-1), strict=True):
+                columns[action] = values
+        return torch.stack(columns, dim=-1)
+
+
 def state_at_frame(seen: Observation, kinds: Sequence[Kind]) -> Float[Tensor, "batch channel"]:
     """The state at the newest frame, linear between readings; angles go the short way round."""
     state, readings = seen.state.float(), seen.state.shape[1]
@@ -156,3 +201,11 @@ def rotation_matrix(angles: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 
         [sa * sr - ca * sb * cr, sa * cr + ca * sb * sr, ca * cb],
     ]
     return torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2)
+
+
+def pose_angles(matrix: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3"]:
+    """(a, b, r) in radians of Rx(a)·Ry(b)·Rz(r), the inverse of `rotation_matrix`; |b| < 90°."""
+    a = torch.atan2(-matrix[..., 1, 2], matrix[..., 2, 2])
+    b = torch.asin(matrix[..., 0, 2].clamp(-1.0, 1.0))
+    r = torch.atan2(-matrix[..., 0, 1], matrix[..., 0, 0])
+    return torch.stack([a, b, r], dim=-1)

@@ -101,6 +101,33 @@ def find_anchors(
     return tuple(anchors)
 
 
+def find_relative(action: Mapping[str, Any], state: Mapping[str, Any]) -> tuple[Anchor, ...]:
+    """Which channels of the state measure these absolute actions.
+
+    Three angles of the arm's pose are composed as a rotation. Raises `ConfigError` where actions
+    are not absolute, or the state measures none of them.
+    """
+    channels = enumerate(zip(action["names"], action["units"], strict=True))
+    told = {
+        place: measured
+        for place, (name, unit) in (channels if action["kind"] == "absolute" else ())
+        if (measured := _told(name, unit, state)) is not None
+    }
+    if not told:
+        raise ConfigError(
+            "train_head.action_form: relative needs absolute actions that the state measures, of "
+            f"the same name and unit; the actions are {action['kind']}: "
+            f"{', '.join(action['names'])}; the state has {', '.join(state['names']) or 'nothing'}"
+        )
+    angles = [state["names"].index(name) for name in _POSE_ANGLES if name in state["names"]]
+    turned = [place for angle in angles for place, measured in told.items() if measured == angle]
+    if len(turned) < len(_POSE_ANGLES):
+        turned = []
+    plain = [Anchor((place,), (told[place],)) for place in told if place not in turned]
+    rotation = [Anchor(tuple(turned), tuple(angles), composed=True)] if turned else []
+    return (*plain, *rotation)
+
+
 def told_deltas(action: Mapping[str, Any], state: Mapping[str, Any]) -> dict[str, int]:
     """The delta channels that can be anchored one by one, each with its channel of the state."""
     deltas = zip(action["names"], action["units"], strict=True) if action["kind"] == "delta" else ()
@@ -137,6 +164,8 @@ class PolicyShape:
     """The kind of each state channel; empty where all are plain."""
     anchors: tuple[Anchor, ...] = ()
     """Action channels that count from the newest frame; the others from the tick."""
+    relative: tuple[Anchor, ...] = ()
+    """Absolute action channels that are learned as differences from the state at the tick."""
 
     @property
     def kinds(self) -> tuple[Kind, ...]:

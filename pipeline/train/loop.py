@@ -40,7 +40,7 @@ from pipeline.train.run import TrainingRun, policy_shape
 from pipeline.train.sampling import Plan, StepPart
 from pipeline.train.scores import action_space, compare
 from pipeline.train.split import Split
-from pipeline.train.statistics import anchored_channels, fit_normalization
+from pipeline.train.statistics import anchored_channels, fit_normalization, fit_relative
 from pipeline.train.training_data import source_of, split_parts
 
 LOG_EVERY = 10
@@ -100,7 +100,12 @@ class Trainer:
             fitted = partial(fit_normalization, store, split.train, replace(self.windows, **own))
             self.normalization = self.processes.shared(fitted)
             anchored = anchored_channels(store, split.train, params)
-            self.shape = policy_shape(store, self.normalization, anchored)
+            form = params.action_form
+            self.shape = policy_shape(store, self.normalization, anchored, form)
+            relative = partial(fit_relative, store, split.train, self.windows, self.shape)
+            self.normalization = replace(
+                self.normalization, relative=self.processes.shared(relative)
+            )
             self._build()
 
     def _build(self) -> None:

@@ -45,7 +45,7 @@ from pipeline.policy.checkpoint import (
     check_policy,
 )
 from pipeline.policy.normalization import Normalization
-from pipeline.policy.shape import PolicyShape, channel_kinds, find_anchors
+from pipeline.policy.shape import PolicyShape, channel_kinds, find_anchors, find_relative
 from pipeline.store import FeatureStore, build_lock
 from pipeline.train.training_data import list_differences, source_of
 
@@ -276,7 +276,10 @@ def recordings_of(store: FeatureStore) -> dict[str, Any]:
 
 
 def policy_shape(
-    store: FeatureStore, normalization: Normalization, anchor: Sequence[str] = ()
+    store: FeatureStore,
+    normalization: Normalization,
+    anchor: Sequence[str] = (),
+    action_form: Literal["recorded", "relative"] = "recorded",
 ) -> PolicyShape:
     """The widths of this store's streams, and which action channels are anchored.
 
@@ -294,6 +297,7 @@ def policy_shape(
         views=store.array("vl/frame_time").shape[1],
         state_kinds=channel_kinds(state["names"], state["units"]) if normalization.state else (),
         anchors=find_anchors(action, known_state, anchor),
+        relative=find_relative(action, known_state) if action_form == "relative" else (),
     )
 
 

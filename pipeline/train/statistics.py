@@ -15,11 +15,11 @@ from tqdm import tqdm
 from pipeline.base.arrays import first_non_finite, widen
 from pipeline.base.channels import action_groups, usual_spread
 from pipeline.base.config import TrainHeadParams
-from pipeline.base.errors import NumericsError
+from pipeline.base.errors import ConfigError, NumericsError
 from pipeline.policy.attention import right_aligned
 from pipeline.policy.normalization import Block, ChannelStatistics, Normalization, fit_channels
-from pipeline.policy.robot_state import expand
-from pipeline.policy.shape import channel_kinds, expanded_names, told_deltas
+from pipeline.policy.robot_state import RelativeActions, expand
+from pipeline.policy.shape import PolicyShape, channel_kinds, expanded_names, told_deltas
 from pipeline.store import FeatureStore, place
 from pipeline.train.batches import Ticks, Windows, evenly
 
@@ -101,6 +101,35 @@ def anchored_channels(store: FeatureStore, ticks: Ticks, params: TrainHeadParams
         one_way = np.abs(net.mean(axis=0)) >= ONE_WAY * np.sqrt(np.square(net).mean(axis=0))
     channels = zip(action["names"], groups, one_way, strict=True)
     return [n for n, group, away in channels if n in chosen and group == "translation" and not away]
+
+
+def fit_relative(
+    store: FeatureStore, ticks: Ticks, windows: Windows, shape: PolicyShape
+) -> ChannelStatistics | None:
+    """Statistics of chunks with channels relative to the state; None where the shape has none.
+
+    They are over all valid steps of at most 16,384 evenly spaced ticks. Raises `ConfigError` where
+    a training tick has no state.
+    """
+    if not shape.relative:
+        return None
+    starts = store.array("episode/state_start")[store.episode_of(ticks)]
+    if len(lacking := ticks[store.array("tick/state_end")[ticks] <= starts]):
+        raise ConfigError(
+            "train_head.action_form: relative needs a state at every training tick, found none at "
+            f"{place(store, 'tick', int(lacking[0]))}. Leave that episode out, or set recorded."
+        )
+    relative = RelativeActions(shape.relative, shape.kinds)
+    seen = replace(windows, sensor_window=1)
+
+    def read(part: Ticks) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+        batch = store.gather(part, **asdict(seen))
+        chunk = relative.from_absolute(batch.action, batch)
+        return chunk.flatten(0, 1).numpy(), batch.action_valid.flatten().numpy() > 0
+
+    some = evenly(ticks, _STATE_TICKS)
+    parts = np.array_split(some, -(-len(some) // _AT_ONCE))
+    return fit_channels(map(read, parts), "training actions relative to the state")
 
 
 def _fit_state(store: FeatureStore, ticks: Ticks, windows: Windows) -> ChannelStatistics | None:

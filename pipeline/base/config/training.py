@@ -201,6 +201,10 @@ class TrainHeadParams(Section):
     whose motion is in the state. `auto` uses the translations among them; with a sensor, not
     those that always advance in one direction in the training episodes, because the sensor sees
     how far. none: no channel."""
+    action_form: Literal["recorded", "relative"] = "recorded"
+    """relative: absolute actions that the state measures too (`joint_1`, `x` or `pose_x`, in the
+    same unit) are learned as differences from the state at the tick, with statistics of their own;
+    pose angles as a rotation from it. The store and the policy's answers stay absolute."""
     anchor_s: float = Field(default=2.0, gt=0, le=3600)
     """Most seconds that the motion since a frame is known; an older frame counts as this old."""
     sensor_lag_s: float = Field(default=0.0, ge=0, le=3600)
@@ -294,6 +298,14 @@ class TrainHeadParams(Section):
             raise ValueError(
                 "anchor counts from the newest frame by the state's motion: enable features and "
                 "robot state, or set anchor to none"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _relative_to_a_state(self) -> "TrainHeadParams":
+        if self.action_form == "relative" and not self.robot_state_enabled:
+            raise ValueError(
+                "action_form relative counts from the robot's state: enable it, or set recorded"
             )
         return self
 
