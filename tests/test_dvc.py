@@ -6,6 +6,7 @@ import re
 import shutil
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -22,6 +23,7 @@ TINY = {
     "train_head": {"max_steps": 6, "eval_every": 3, "checkpoint_every": 3, "warmup_steps": 1},
     "rollout": {"episodes": 1},
 }
+NOTES = ("params.yaml", "dvc.lock")
 
 
 class Project:
@@ -78,7 +80,7 @@ class Project:
 
 
 @pytest.fixture(scope="module")
-def project(tmp_path_factory: pytest.TempPathFactory) -> Project:
+def reproduced(tmp_path_factory: pytest.TempPathFactory) -> Project:
     """The project after one `dvc repro`."""
     if shutil.which("git") is None or not (ROOT / ".git").exists():
         pytest.skip("needs git and the project's own repository")
@@ -86,6 +88,15 @@ def project(tmp_path_factory: pytest.TempPathFactory) -> Project:
     made.set(**TINY)
     made.dvc("repro")
     return made
+
+
+@pytest.fixture
+def project(reproduced: Project) -> Iterator[Project]:
+    """The project after `dvc repro`; what a test sets, and what DVC notes of it, is undone."""
+    notes = {path: path.read_bytes() for path in map(reproduced.folder.joinpath, NOTES)}
+    yield reproduced
+    for path, content in notes.items():
+        path.write_bytes(content)
 
 
 def test_dvc_removes_no_output_that_a_param_names():
@@ -121,7 +132,6 @@ def test_no_other_pipeline_claims_outputs():
     ],
 )
 def test_a_folder_of_the_user_survives_a_param_that_names_it(project, stage, values):
-    before = (project.folder / "params.yaml").read_text()
     thesis = project.folder / "notes/thesis.txt"
     thesis.parent.mkdir(exist_ok=True)
     thesis.write_text("mine")
@@ -130,7 +140,6 @@ def test_a_folder_of_the_user_survives_a_param_that_names_it(project, stage, val
         assert "move it away" in project.dvc("repro", "-s", stage, code=255)
         assert thesis.read_text() == "mine"
     finally:
-        (project.folder / "params.yaml").write_text(before)
         shutil.rmtree(thesis.parent)
 
 
@@ -165,29 +174,25 @@ def test_metrics_and_plots_are_declared(project):
 
 
 def test_a_param_makes_its_own_stage_stale_and_none_before(project):
-    before = (project.folder / "params.yaml").read_text()
-    try:
-        project.set(extract={"batch_size": 3, "decode_threads": 1})
-        assert project.stale() == {}
-        project.set(
-            vlm={"prompt": "{images}{instruction}"},
-            extract={"dtype": "float16"},
-            train_head={"lr": 0.123},
-            evaluate={"batch_size": 3},
-            rollout={"seed": 3},
-        )
-        changed = {
-            stage: set(said["changed deps"]["params.yaml"])
-            for stage, (said, *_) in project.stale().items()
-        }
-        assert changed == {
-            "extract": {"vlm", "extract.dtype"},
-            "train_head": {"train_head"},
-            "evaluate": {"evaluate"},
-            "rollout": {"rollout"},
-        }
-    finally:
-        (project.folder / "params.yaml").write_text(before)
+    project.set(extract={"batch_size": 3, "decode_threads": 1})
+    assert project.stale() == {}
+    project.set(
+        vlm={"prompt": "{images}{instruction}"},
+        extract={"dtype": "float16"},
+        train_head={"lr": 0.123},
+        evaluate={"batch_size": 3},
+        rollout={"seed": 3},
+    )
+    changed = {
+        stage: set(said["changed deps"]["params.yaml"])
+        for stage, (said, *_) in project.stale().items()
+    }
+    assert changed == {
+        "extract": {"vlm", "extract.dtype"},
+        "train_head": {"train_head"},
+        "evaluate": {"evaluate"},
+        "rollout": {"rollout"},
+    }
 
 
 def test_own_data_leave_the_demo_alone_and_an_added_episode_computes_its_rows(project, tmp_path):

@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 import torch
 
-from experiments import closed_loop, sight
+from experiments import closed_loop
+from experiments import sight
 from experiments.recipes import (
     RECIPES,
     ROLLOUTS,

@@ -84,7 +84,8 @@ def words(schema: Schema, definitions: Schema) -> str:
         return f"list of {'sections' if each == 'section' else f'({each})'}{least}"
     if schema["type"] == "object":
         names = words(schema["propertyNames"], definitions) if "propertyNames" in schema else "text"
-        return f"mapping from {names} to {words(schema['additionalProperties'], definitions)}"
+        values = schema["additionalProperties"]
+        return f"mapping from {names} to {'any' if values is True else words(values, definitions)}"
     if schema.get("format") == "path":
         return "path"
     return SIMPLE[schema["type"]] + _range(schema)

@@ -145,25 +145,6 @@ class LeRobotArm:
         self._sent = {key: float(sent.get(key, value)) for key, value in goal.items()}
 
 
-def describe(
-    robot: Any, cameras: Mapping[str, str] | None = None, motors: Mapping[str, str] | None = None
-) -> dict[str, Any]:
-    """The description of a LeRobot robot for `PolicyClient(robot=...)`, with absolute actions.
-
-    Motors and cameras are in the robot's order, with the names of `motors` and `cameras`. For a
-    policy of deltas replace `action` and `action_kind`; add `state_units` and `action_units` where
-    the training data had any.
-    """
-    own = {key: name for name, key in {**(motors or {}), **(cameras or {})}.items()}
-    images = [key for key, kind in robot.observation_features.items() if isinstance(kind, tuple)]
-    return {
-        "state": [own.get(key, key) for key in robot.observation_features if key not in images],
-        "action": [own.get(key, key) for key in robot.action_features],
-        "action_kind": "absolute",
-        "views": [own.get(key, key) for key in images],
-    }
-
-
 def _matched(
     names: Sequence[str], given: Mapping[str, str], features: Mapping[str, Any]
 ) -> list[str]:

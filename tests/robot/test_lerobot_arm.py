@@ -1,25 +1,15 @@
 """A robot shaped like LeRobot's is driven by the policy's channels, and refused where it is not."""
 
-import importlib.util
-import json
 import threading
 from collections.abc import Mapping
-from functools import partial
-from pathlib import Path
-from types import MethodType
 from typing import Any
 
 import numpy as np
 import pytest
 
-from pipeline.base.config import Source
 from pipeline.base.errors import CheckpointMismatch
-from pipeline.data import open_recordings
-from pipeline.robot.client import refuse_other_robot
-from pipeline.robot.lerobot_arm import LeRobotArm, describe
-from pipeline.robot.realtime import RunSettings
+from pipeline.robot.lerobot_arm import LeRobotArm
 
-EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "lerobot_arm.py"
 MOTORS = ("shoulder_pan", "elbow_flex", "gripper")
 SO101 = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll", "gripper")
 
@@ -178,7 +168,7 @@ def test_stop_waits_for_a_command_under_way_but_not_for_one_that_hangs(
         assert (robot.sent[-1], said) == (robot.place, [])
 
 
-def test_names_that_differ_are_mapped_and_describe_the_robot() -> None:
+def test_names_that_differ_are_mapped() -> None:
     names = ("joint_1", "joint_2", "jaw")
     motors = {name: f"{motor}.pos" for name, motor in zip(names, MOTORS, strict=True)}
     robot, cameras = Follower(), {"View1": "front"}
@@ -186,12 +176,6 @@ def test_names_that_differ_are_mapped_and_describe_the_robot() -> None:
     assert arm.observe()["state"].tolist() == [[0.0, 1.0, 2.0]]
     arm.act(np.array([1.0, 2.0, 3.0]))
     assert list(robot.sent[0].values()) == [1.0, 2.0, 3.0]
-    assert describe(robot, cameras, {"joint_1": "shoulder_pan.pos"}) == {
-        "state": (own := ["joint_1", "elbow_flex.pos", "gripper.pos"]),
-        "action": own,
-        "action_kind": "absolute",
-        "views": ["View1"],
-    }
 
 
 @pytest.mark.parametrize(
@@ -219,121 +203,3 @@ def test_a_delta_of_a_motor_that_is_not_observed_is_refused() -> None:
     metadata = metadata_of(kind="delta", moving=(True, True, False), state=(), views=("front",))
     with pytest.raises(CheckpointMismatch, match=r"found \['elbow_flex.pos', 'shoulder_pan.pos'\]"):
         LeRobotArm(Blind(), metadata)
-
-
-class Policy:
-    """A policy for an SO-101 behind no wire: all motors a hundredth from where they are, or one by
-    `far` more."""
-
-    far = 0.0
-
-    def __init__(self, url: str, robot: Mapping[str, Any]) -> None:
-        names = [f"{motor}.pos" for motor in SO101]
-        action = {"names": names, "units": [""] * 6, "kind": "absolute"}
-        streams = {"action": action, "state": {"names": names, "units": [""] * 6}}
-        self.metadata: dict[str, Any] = {
-            "streams": {**streams, "views": ["View1"]},
-            "moving": [False] * 6,
-            "horizon": 8,
-            "action_dim": 6,
-            "action_hz": 50.0,
-            "vlm_reuse_count": 3,
-            "uses_features": True,
-            "looks_at": ["features", "state"],
-            "feature_spec": {"digest": "d"},
-            "feature_spec_digest": "d",
-            "state_window": 5,
-            "sensor_window": 5,
-        }
-        refuse_other_robot(robot, self.metadata)
-        self.key = np.zeros(16, np.uint8)
-
-    def __enter__(self) -> "Policy":
-        return self
-
-    def __exit__(self, *told: object) -> None:
-        pass
-
-    def infer(self, observation: Mapping[str, Any]) -> dict[str, Any]:
-        self.key = self.key + ("images/View1" in observation)
-        chunk = np.tile(np.arange(6, dtype=np.float32) + np.float32(0.01), (8, 1))
-        chunk[:, 1] += self.far
-        return {"actions": chunk, "feature_key": self.key, "feature_age_s": 0.01}
-
-
-class Filming(Follower):
-    """An SO-101 whose camera gives another image each time."""
-
-    def __init__(self) -> None:
-        super().__init__(motors=SO101)
-
-    def get_observation(self) -> dict[str, Any]:
-        self.image = self.image + np.uint8(1)
-        return super().get_observation()
-
-
-@pytest.fixture
-def example(monkeypatch: pytest.MonkeyPatch, simulated_time: Any) -> Any:
-    spec = importlib.util.spec_from_file_location("lerobot_arm_example", EXAMPLE)
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    monkeypatch.setattr(module, "PolicyClient", Policy)
-    arm = partial(LeRobotArm, clock_s=simulated_time.monotonic)
-    monkeypatch.setattr(module, "LeRobotArm", arm)
-    monkeypatch.setattr(module, "CAMERAS", {"View1": "front"})
-    return module
-
-
-def test_the_example_drives_a_robot_and_records_it(example: Any, tmp_path) -> None:
-    robot = Filming()
-    example.drive(robot, RunSettings("Push", seconds=1.0), tmp_path)
-    (root,) = tmp_path.iterdir()
-    (recording,) = open_recordings([Source(name="runs", path=str(root))], tmp_path).recordings
-    action, state = recording.action(), recording.state()
-    assert action is not None and state is not None and action.kind == "absolute"
-    assert len(action.time) == len(robot.sent) - 1 == 49, "all but the stop"
-    wanted = np.tile(np.arange(6, dtype=np.float32) + np.float32(0.01), (len(action.time), 1))
-    np.testing.assert_array_equal(action.values, wanted)
-    assert robot.sent[-1] == robot.place
-    assert list(recording.cameras()) == ["View1"] and recording.instruction == "Push"
-    assert json.loads((root / "run.json").read_text())["settings"]["seconds"] == 1.0
-
-
-def test_the_example_makes_too_fast_a_step_slower_and_stops_before_too_large_a_one(
-    example: Any, tmp_path, monkeypatch, capsys
-) -> None:
-    """The run that a first action beyond a limit stops is kept."""
-    monkeypatch.setattr(Policy, "far", 10.0)
-    robot = Filming()
-    example.drive(robot, RunSettings("Push", seconds=0.3), tmp_path / "slower")
-    assert robot.sent[0]["shoulder_lift.pos"] <= 2.81 and len(robot.sent) > 1
-    monkeypatch.setattr(Policy, "far", 90.0)
-    robot, root = Filming(), tmp_path / "run_000000"
-    example.drive(robot, RunSettings("Push", seconds=5.0), tmp_path)
-    assert robot.sent == [robot.place], "the stop alone"
-    printed = capsys.readouterr().out.rstrip()
-    assert "step of shoulder" in printed and printed.endswith(f": {root}")
-    (recording,) = open_recordings([Source(name="runs", path=str(root))], tmp_path).recordings
-    state = recording.state()
-    assert state is not None and len(state.time) and list(recording.cameras()) == ["View1"]
-    assert "step of shoulder" in json.loads((root / "run.json").read_text())["reason"]
-
-
-def test_the_example_says_why_a_run_without_an_observation_is_not_recorded(
-    example: Any, tmp_path, capsys
-) -> None:
-    def fail(self: Filming) -> dict[str, Any]:
-        raise RuntimeError("bus error")
-
-    robot = Filming()
-    robot.get_observation = MethodType(fail, robot)
-    example.drive(robot, RunSettings("Push", seconds=5.0), tmp_path)
-    printed = capsys.readouterr().out
-    assert "None" not in printed and "bus error" in printed
-    assert f"{tmp_path / 'run_000000.part'}: expected a tick" in printed
-
-
-def test_the_example_refuses_a_policy_for_another_robot(example: Any, tmp_path) -> None:
-    with pytest.raises(CheckpointMismatch, match="trained on another robot"):
-        example.drive(Follower(), RunSettings("Push"), tmp_path)

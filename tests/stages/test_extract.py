@@ -330,12 +330,6 @@ def test_channel_names_of_two_embodiments_are_shown_without_control_characters(
     assert "\x1b" not in err
 
 
-def test_a_path_that_is_the_whole_file_system(capsys, params_file):
-    for path in ("/*", "../" * 30 + "**"):
-        err = refused(capsys, params_file, f"data.sources=[{{name: lab, path: {path}}}]")
-        assert f"found '{path}', the whole file system. Set the source's path to the" in err
-
-
 def test_a_file_that_is_not_there_is_looked_for_once_for_all_its_episodes(
     capsys, params_file, tmp_path, monkeypatch
 ):

@@ -8,7 +8,7 @@ A long episode costs no more than a short one:
   neighbours, evenly spread. The packets of a whole video are read in any case.
 
 Equal pictures prove a frozen camera only if its pictures have noise: if most pixels differ between
-neighbours. The pictures of a simulation, and of a video
+neighbours, also just before and after equal ones. The pictures of a simulation, and of a video
 whose encoder skips what stands still, are equal whenever nothing moves. Such a camera counts as
 frozen if every other camera of the episode sees something move meanwhile; a single camera counts as
 frozen only if it never changes at all.
@@ -157,6 +157,7 @@ def _compare(view: EpisodeView, name: str, camera: CameraStream) -> _Compared:
     noisy = len(neighbours) > 0 and float(np.percentile(neighbours, 10)) > NOISY
     if repeats is None:
         return _Compared(index, differing == 0, blank, noisy)
+    noisy = noisy and all(share > NOISY for share in _beside(camera, repeats))
     return _Compared(np.arange(count), repeats, blank, noisy)
 
 
@@ -167,6 +168,14 @@ def _is_blank(frame: NDArray[np.uint8]) -> bool:
 def _share_differing(before: NDArray[np.uint8], after: NDArray[np.uint8]) -> float:
     """Share of pixels that differ; 1 if the sizes differ."""
     return float((before != after).any(axis=2).mean()) if before.shape == after.shape else 1.0
+
+
+def _beside(camera: CameraStream, equal: NDArray[np.bool_]) -> Iterator[float]:
+    """Share of pixels that differ just before and just after the longest runs of equal pairs."""
+    for first, last in sorted(runs(equal), key=lambda run: run[0] - run[1])[:RUNS]:
+        for place in (first - 1, last):
+            if 0 <= place < len(equal):
+                yield _share_differing(*camera.read([place, place + 1]))
 
 
 def _spread_runs(frames: int, most: int) -> NDArray[np.int64]:
