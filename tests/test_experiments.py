@@ -12,8 +12,7 @@ import numpy as np
 import pytest
 import torch
 
-from experiments import closed_loop
-from experiments import sight
+from experiments import closed_loop, sight
 from experiments.recipes import (
     RECIPES,
     ROLLOUTS,

@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from benchmarks import real_shape
-from benchmarks import stage_one
+from benchmarks import real_shape, stage_one
 from benchmarks.cases import Case
 from benchmarks.extract import _deviation, measure
 from benchmarks.profiling import Stopwatch
