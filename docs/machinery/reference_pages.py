@@ -13,7 +13,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[2]
 LEFT_OUT = "pipeline.base.config"
 """`params.md` says it better."""
-IN_FULL = {"data": ("discovery", "recording", "timeline"), "store": ("schema", "reader", "batch")}
+IN_FULL = {"data": ("discovery", "recording", "timeline"), "store": ("schema", "reader", "gather")}
 """Modules of a package that are shown in full, beside what its `__all__` offers."""
 
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from pipeline.base.config import Params, Source
+from pipeline.base.config import DriveParams, Params, Source
 from pipeline.base.errors import CheckpointMismatch, ConfigError, RobotStopped
 from pipeline.data import open_recordings
 from pipeline.robot.drive import drive, make_robot
@@ -187,6 +187,12 @@ def test_what_cannot_be_driven_is_refused_by_its_key(
     for place, changed in wrong.items():
         with pytest.raises(ConfigError, match=place):
             driven(**changed)
+
+
+def test_the_default_robot_is_the_simulated_arm() -> None:
+    robot = make_robot(DriveParams().robot, {"seed": 3})
+    assert robot.observe()["state"].shape[1] == 12
+    robot.close()
 
 
 def test_a_class_of_the_current_folder_is_found_and_its_description_compared(

@@ -139,7 +139,7 @@ class ServeParams(Section):
 class DriveParams(Section):
     """Which robot is driven, by which policy, and what ends the run."""
 
-    robot: str = "pipeline.simulation.realtime:SimulatedRobot"
+    robot: str = "pipeline.simulation.environment:SimulatedRobot"
     """`module:Class` of a class with `observe`, `frames`, `act` and `stop`, or with LeRobot's
     interface; or `lerobot:TYPE`, an arm of an installed LeRobot, such as `lerobot:so101_follower`.
     """
