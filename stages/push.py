@@ -31,11 +31,8 @@ def main(params: "Params") -> None:
     """Upload what `push` names."""
     from huggingface_hub import HfApi
 
-    from pipeline.base.errors import ConfigError
     from pipeline.look.hub import push
 
-    if not params.push.repo:
-        raise ConfigError("push.repo: expected owner/name, found nothing. Name it as an argument")
     push(params, HfApi(library_name="vla-feature-cache"), partial(print, flush=True))
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pipeline.base.config import Params
-from pipeline.base.errors import HubError, StoreMismatch
+from pipeline.base.errors import ConfigError, HubError, StoreMismatch
 from pipeline.base.text import Table
 from pipeline.policy.checkpoint import DOCUMENT, PolicyCheckpoint, find_policy, load_policy
 from pipeline.store import FeatureStore
@@ -29,6 +29,8 @@ def push(params: Params, api: "HfApi", say: Callable[[str], None] = print) -> No
     is neither a policy nor a store, and what opening it raises.
     """
     wanted = params.push
+    if not could_be_hub_id(wanted.repo):
+        raise ConfigError(f"push.repo: expected owner/name, found {wanted.repo!r}")
     folder = wanted.folder or params.train_head.output
     if (folder / "zarr.json").exists():
         kind, files = "dataset", _files_below(folder)
@@ -76,11 +78,18 @@ def _upload(
     operations.append(CommitOperationAdd("README.md", card.encode()))
     try:
         api.create_repo(repo, repo_type=kind, private=private, exist_ok=True)
+        if private and not api.repo_info(repo, repo_type=kind).private:
+            raise HubError(
+                f"push.repo: {repo} is there and public. Set push.private=false if you mean it, or "
+                "name another"
+            )
         commit = api.create_commit(
             repo, operations, commit_message=f"Upload by {_LIBRARY}", repo_type=kind
         )
+    except HubError:
+        raise
     except (HfHubHTTPError, HFValidationError, LocalTokenNotFoundError, *_network()) as error:
-        why = str(error).strip().splitlines()[0]
+        why = (str(error).strip() or type(error).__name__).splitlines()[0]
         raise HubError(
             f"push.repo: {repo}: {why}. Log in with a token that may write (hf auth login), and "
             "name a repository of yours as owner/name"
@@ -122,9 +131,10 @@ def policy_card(
         *_section(
             "What it needs",
             [
-                f"The features of `{model}` with this feature spec (`{spec['digest']}`): layers, "
-                f"pooling, image size and prompt are in `{DOCUMENT}`. Before it serves, the "
-                "model proves on golden rows that it gives them.",
+                f"The features of {_named(model)} with this feature spec (`{spec['digest']}`): "
+                f"layers, pooling, image size and prompt are in `{DOCUMENT}`; the weights of the "
+                f"model have the digest `{spec['weights']}`. Before it serves, the model proves "
+                "on golden rows that it gives them.",
                 "```",
                 f"hf download {repo} --local-dir models/{repo.split('/')[-1]}",
                 f"python -m stages.serve --set serve.checkpoint=models/{repo.split('/')[-1]}",
@@ -176,9 +186,18 @@ def _front(kind: str, repo: str, model: str | None) -> list[str]:
     entries = [f"library_name: {_LIBRARY}", "tags: [robotics, vision-language-action]"]
     if kind == "model":
         entries.append("pipeline_tag: robotics")
-    if model is not None and could_be_hub_id(model) and folder_here(model) is None:
+    if model is not None and _is_on_the_hub(model):
         entries.append(f"base_model: {model}")
     return ["---", *entries, "---", f"# {repo.split('/')[-1]}"]
+
+
+def _is_on_the_hub(model: str) -> bool:
+    return could_be_hub_id(model) and folder_here(model) is None
+
+
+def _named(model: str) -> str:
+    """The model of the params by its hub id; a local folder says nothing to others."""
+    return f"`{model}`" if _is_on_the_hub(model) else "a Qwen2.5-VL"
 
 
 def _section(title: str, lines: Sequence[str]) -> list[str]:

@@ -137,9 +137,10 @@ class _Log:
             self.curves(name, channels, time, values)
             return
         self.curves(f"{name}/{channels[0]}", channels[:1], time, values[:, 0])
-        low, high = np.percentile(values[:, 1:], [1, 99])
-        scaled = np.clip((values[:, 1:] - low) / max(high - low, 1e-12), 0, 1)
-        edges = np.searchsorted(time, np.arange(time[0], time[-1], 1 / _SCAN_HZ) + 1 / _SCAN_HZ)
+        low, high = np.nanpercentile(values[:, 1:], [1, 99])
+        scaled = np.nan_to_num(np.clip((values[:, 1:] - low) / max(high - low, 1e-12), 0, 1))
+        begun = np.searchsorted(time, np.arange(time[0], time[-1], 1 / _SCAN_HZ))
+        edges = np.unique([*begun[1:], len(time)])  # no image without a reading
         spans = list(zip([0, *edges[:-1]], edges, strict=True))
         images = ((255 * scaled[start:stop]).astype(np.uint8) for start, stop in spans)
         self.images(f"{name}/image", time[edges - 1], images)

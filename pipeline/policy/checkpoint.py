@@ -122,6 +122,8 @@ class PolicyDocument(SourceDocument):
             if actual not in fitting:
                 any_of = " or ".join(sorted(map(shown, fitting)))
                 raise ValueError(f"{place}: expected {any_of}, found {shown(actual)}")
+        if any(len(pair.action) != 1 or len(pair.state) != 1 for pair in shape.relative):
+            raise ValueError("shape.relative: expected one action and one state channel each")
         for anchor in (*shape.anchors, *shape.relative):
             pairs = ((anchor.action, shape.action_dim), (anchor.state, shape.state_dim))
             if any(channel >= size for channels, size in pairs for channel in channels):

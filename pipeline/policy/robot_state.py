@@ -93,8 +93,7 @@ class Anchoring:
 class RelativeActions:
     """Absolute chunks as differences from the state at the tick, and back, in physical units.
 
-    Every step counts from the same state. Angles go the short way round. The three angles of a
-    pose become the rotation vector, in degrees, of R(action)·R(state)ᵀ. A sample without a state
+    Every step counts from the same state; angles go the short way round. A sample without a state
     gives NaN, which stops a robot.
     """
 
@@ -116,21 +115,10 @@ class RelativeActions:
         now = torch.where(known, seen.state[:, -1].float(), torch.nan).unsqueeze(1)
         columns = list(chunks.float().unbind(-1))
         for channel in self.channels:
-            places = list(channel.state)
-            own = torch.stack([columns[action] for action in channel.action], dim=-1)
-            here = now[..., places]
-            if channel.composed:
-                turn = rotation_matrix(here.deg2rad())
-                if back:
-                    own = pose_angles(_matrix(own.deg2rad()) @ turn).rad2deg()
-                else:
-                    own = _vector(rotation_matrix(own.deg2rad()) @ turn.mT).rad2deg()
-            elif back:
-                own = own + here
-            else:
-                own = _difference(own, here, [self.kinds[place] for place in places])
-            for action, values in zip(channel.action, own.unbind(-1), strict=True):
-                columns[action] = values
+            (action,), (place,) = channel.action, channel.state
+            own, here = columns[action].unsqueeze(-1), now[..., place : place + 1]
+            moved = own + here if back else _difference(own, here, [self.kinds[place]])
+            columns[action] = moved.squeeze(-1)
         return torch.stack(columns, dim=-1)
 
 
@@ -201,11 +189,3 @@ def rotation_matrix(angles: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 
         [sa * sr - ca * sb * cr, sa * cr + ca * sb * sr, ca * cb],
     ]
     return torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2)
-
-
-def pose_angles(matrix: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3"]:
-    """(a, b, r) in radians of Rx(a)·Ry(b)·Rz(r), the inverse of `rotation_matrix`; |b| < 90°."""
-    a = torch.atan2(-matrix[..., 1, 2], matrix[..., 2, 2])
-    b = torch.asin(matrix[..., 0, 2].clamp(-1.0, 1.0))
-    r = torch.atan2(-matrix[..., 0, 1], matrix[..., 0, 0])
-    return torch.stack([a, b, r], dim=-1)

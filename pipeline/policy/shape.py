@@ -104,28 +104,25 @@ def find_anchors(
 def find_relative(action: Mapping[str, Any], state: Mapping[str, Any]) -> tuple[Anchor, ...]:
     """Which channels of the state measure these absolute actions.
 
-    Three angles of the arm's pose are composed as a rotation. Raises `ConfigError` where actions
-    are not absolute, or the state measures none of them.
+    Angles of the arm's pose are left out: a rotation is no difference of angles. Raises
+    `ConfigError` where actions are not absolute, or the state measures none of them.
     """
-    channels = enumerate(zip(action["names"], action["units"], strict=True))
-    told = {
-        place: measured
-        for place, (name, unit) in (channels if action["kind"] == "absolute" else ())
-        if (measured := _told(name, unit, state)) is not None
-    }
-    if not told:
+    kinds = channel_kinds(state["names"], state["units"])
+    absolute = action["kind"] == "absolute"
+    channels = zip(action["names"], action["units"], strict=True) if absolute else ()
+    told = [_told(name, unit, state) for name, unit in channels]
+    pairs = [
+        Anchor((place,), (measured,))
+        for place, measured in enumerate(told)
+        if measured is not None and kinds[measured] != "rotation"
+    ]
+    if not pairs:
         raise ConfigError(
             "train_head.action_form: relative needs absolute actions that the state measures, of "
             f"the same name and unit; the actions are {action['kind']}: "
             f"{', '.join(action['names'])}; the state has {', '.join(state['names']) or 'nothing'}"
         )
-    angles = [state["names"].index(name) for name in _POSE_ANGLES if name in state["names"]]
-    turned = [place for angle in angles for place, measured in told.items() if measured == angle]
-    if len(turned) < len(_POSE_ANGLES):
-        turned = []
-    plain = [Anchor((place,), (told[place],)) for place in told if place not in turned]
-    rotation = [Anchor(tuple(turned), tuple(angles), composed=True)] if turned else []
-    return (*plain, *rotation)
+    return tuple(pairs)
 
 
 def told_deltas(action: Mapping[str, Any], state: Mapping[str, Any]) -> dict[str, int]:
@@ -187,6 +184,10 @@ class PolicyShape:
     def anchored(self, names: Sequence[str]) -> list[str]:
         """The names of the action channels that count from the newest frame."""
         return [names[channel] for anchor in self.anchors for channel in anchor.action]
+
+    def relative_to_state(self, names: Sequence[str]) -> list[str]:
+        """The names of the action channels that are learned as differences from the state."""
+        return [names[channel] for anchor in self.relative for channel in anchor.action]
 
     def stream_axes(self) -> dict[str, Axes]:
         """The axes behind the batch of each field of an `Observation` of this shape."""

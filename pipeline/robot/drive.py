@@ -19,7 +19,7 @@ from pipeline.base.errors import ConfigError, RobotStopped
 from pipeline.robot.client import TOKEN_VARIABLE, PolicyClient, refuse_other_robot
 from pipeline.robot.lerobot_arm import LeRobotArm
 from pipeline.robot.limits import Limits
-from pipeline.robot.loop import StopKind
+from pipeline.robot.loop import StopKind, check_chunking
 from pipeline.robot.realtime import PolicySession, Robot, RunSettings, run_robot
 from pipeline.robot.recorder import RunRecorder
 from pipeline.robot.run_report import RunReport
@@ -38,17 +38,16 @@ def drive(params: Params, say: Callable[[str], None] = print) -> RunReport:
     """
     wanted = params.drive
     settings = _settings(wanted)
-    robot = make_robot(wanted.robot, wanted.robot_args)
     with ExitStack() as opened:
+        robot = opened.enter_context(_left(make_robot(wanted.robot, wanted.robot_args), say))
         policy = opened.enter_context(_policy(params, say))
         settings = _with_instruction(settings, policy.metadata["instructions"])
         hz = settings.hz or policy.metadata["action_hz"]
         limits = None if wanted.limits is None else Limits.read(wanted.limits, policy.metadata, hz)
         if limits is None:
-            say(
-                "warning: no limits (drive.limits); a wrong action moves the robot as far as it can"
-            )
-        arm = opened.enter_context(_connected(robot, wanted, policy.metadata))
+            say("warning: without drive.limits any action of the policy is sent to the robot")
+        check_chunking(settings.chunking, policy.metadata["stochastic"])
+        arm = _connected(robot, wanted, policy.metadata)
         recorder = None
         if wanted.runs is not None:
             document = {**vars(settings), "robot": wanted.robot}
@@ -70,14 +69,18 @@ def make_robot(name: str, arguments: Mapping[str, Any]) -> Any:
         raise ConfigError(f"drive.robot: expected module:Class or lerobot:TYPE, found {name!r}")
     if module == _LEROBOT:
         return _lerobot_robot(made, arguments)
-    with _searching_here():
-        try:
-            made_by = getattr(import_module(module), made)
-        except (ImportError, AttributeError) as error:
-            raise ConfigError(
-                f"drive.robot: {name}: {error}. Name a class of a module that python finds from "
-                f"{Path.cwd()}"
-            ) from error
+    if "" not in sys.path:
+        sys.path.insert(0, "")  # the current folder, as with `python -m`
+    try:
+        home = import_module(module)
+    except ImportError as error:
+        raise ConfigError(
+            f"drive.robot: {name}: {error}. Name a class of a module that python finds from "
+            f"{Path.cwd()}"
+        ) from error
+    made_by = getattr(home, made, None)
+    if made_by is None:
+        raise ConfigError(f"drive.robot: {name}: expected {made} in {home.__file__}, found none")
     try:
         bound = inspect.signature(made_by).bind(**arguments)
     except TypeError as error:
@@ -97,7 +100,7 @@ def _lerobot_robot(kind: str, config: Mapping[str, Any]) -> Any:
         ) from error
     for package in (robots, cameras):  # Each registers its config when it is imported.
         for module in iter_modules(package.__path__):
-            with suppress(ImportError):  # Of a robot whose drivers are not installed.
+            with suppress(Exception):  # Of another robot, whose drivers are missing or broken.
                 import_module(f"{package.__name__}.{module.name}")
     try:
         chosen = draccus.decode(robots.RobotConfig, {"type": kind, **config})
@@ -108,30 +111,28 @@ def _lerobot_robot(kind: str, config: Mapping[str, Any]) -> Any:
 
 
 @contextmanager
-def _searching_here() -> Generator[None]:
-    """Modules are looked for in the current folder, too, as `python -m` does."""
-    sys.path.insert(0, "")
+def _left(robot: Any, say: Callable[[str], None]) -> Generator[Any]:
+    """The robot; afterwards it is disconnected or closed, and a failure of that is only printed."""
     try:
-        yield
+        yield robot
     finally:
-        sys.path.remove("")
-
-
-@contextmanager
-def _connected(robot: Any, wanted: DriveParams, metadata: Mapping[str, Any]) -> Generator[Robot]:
-    """The robot as the control loop drives it; afterwards it is disconnected."""
-    refuse_other_robot(getattr(robot, "description", {}), metadata)
-    with ExitStack() as leaving:
         leave = getattr(robot, "disconnect", None) or getattr(robot, "close", None)
-        if leave is not None:
-            leaving.callback(leave)
-        if hasattr(robot, "connect"):
-            robot.connect()
-        if hasattr(robot, "get_observation"):
-            names, latency_s = (wanted.cameras, wanted.motors), wanted.camera_latency_s
-            yield LeRobotArm(robot, metadata, *names, camera_latency_s=latency_s)
-        else:
-            yield robot
+        if leave is not None and getattr(robot, "is_connected", True):
+            try:
+                leave()
+            except Exception as error:  # What ended the run must still be told.
+                say(f"warning: the robot was not disconnected ({error}): see that it stands still")
+
+
+def _connected(robot: Any, wanted: DriveParams, metadata: Mapping[str, Any]) -> Robot:
+    """The robot as the control loop drives it, connected."""
+    refuse_other_robot(getattr(robot, "description", {}), metadata)
+    if hasattr(robot, "connect"):
+        robot.connect()
+    if hasattr(robot, "get_observation"):
+        names, latency_s = (wanted.cameras, wanted.motors), wanted.camera_latency_s
+        return LeRobotArm(robot, metadata, *names, camera_latency_s=latency_s)
+    return robot
 
 
 @contextmanager

@@ -180,6 +180,7 @@ def describe(checkpoint: PolicyCheckpoint, folder: str, given: Inputs) -> dict[s
         "inputs": [_input(checkpoint, name, value) for name, value in given.items()],
         "outputs": [outputs],
         "anchored": checkpoint.shape.anchored(action["names"]),
+        "relative": checkpoint.shape.relative_to_state(action["names"]),
         "guides": "not exported: real-time chunking (rtc) differentiates the head",
     }
 
@@ -346,7 +347,9 @@ def random_inputs(checkpoint: PolicyCheckpoint, policy: Policy, rows: int, seed:
     given: dict[str, NDArray[Any]] = {}
     for stream in policy.encoders:
         given[stream] = values = _drawn(checkpoint, stream, rows, rng)
-        count = rng.choice([0, 1, values.shape[1] // 2, values.shape[1]], rows)
+        # Without a state, actions that are relative to it are NaN.
+        least = int(stream == "state" and bool(policy.shape.relative))
+        count = rng.choice([least, 1, values.shape[1] // 2, values.shape[1]], rows)
         given[VALIDITY[stream]] = count
         if stream in AGES:
             reach_s: float = getattr(checkpoint.params, f"{stream}_window_s") or 1.0

@@ -135,6 +135,7 @@ class ServedPolicy:
             "horizon": params.horizon,
             "action_dim": self.policy.shape.action_dim,
             "anchored": self.policy.shape.anchored(source["streams"]["action"]["names"]),
+            "relative": self.policy.shape.relative_to_state(source["streams"]["action"]["names"]),
             "moving": list(moving_channels(source["streams"]["action"])),
             "model_type": params.model_type,
             "stochastic": self.policy.stochastic,
@@ -197,6 +198,10 @@ class Session:
         self._look_first(observation)
         vlm_s = self._look(observation) if self.metadata["uses_features"] else 0.0
         fields = self._memory.observation()
+        if self.metadata["relative"] and not fields["state_valid"]:
+            raise ObservationError(
+                "state: expected a reading, from which the policy's actions count, found none"
+            )
         actions, head_s = self._served.chunk(fields, self._drawn, observation.guide)
         whole_s = perf_counter() - self._asked_s
         wait_s = max(0.0, whole_s - vlm_s - head_s)

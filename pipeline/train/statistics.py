@@ -16,6 +16,7 @@ from pipeline.base.arrays import first_non_finite, widen
 from pipeline.base.channels import action_groups, usual_spread
 from pipeline.base.config import TrainHeadParams
 from pipeline.base.errors import ConfigError, NumericsError
+from pipeline.base.source import CLOCK_SLACK_S
 from pipeline.policy.attention import right_aligned
 from pipeline.policy.normalization import Block, ChannelStatistics, Normalization, fit_channels
 from pipeline.policy.robot_state import RelativeActions, expand
@@ -109,16 +110,11 @@ def fit_relative(
     """Statistics of chunks with channels relative to the state; None where the shape has none.
 
     They are over all valid steps of at most 16,384 evenly spaced ticks. Raises `ConfigError` where
-    a training tick has no state.
+    a tick of the store has no state.
     """
     if not shape.relative:
         return None
-    starts = store.array("episode/state_start")[store.episode_of(ticks)]
-    if len(lacking := ticks[store.array("tick/state_end")[ticks] <= starts]):
-        raise ConfigError(
-            "train_head.action_form: relative needs a state at every training tick, found none at "
-            f"{place(store, 'tick', int(lacking[0]))}. Leave that episode out, or set recorded."
-        )
+    _refuse_without_state(store, windows.state_window_s)
     relative = RelativeActions(shape.relative, shape.kinds)
     seen = replace(windows, sensor_window=1)
 
@@ -130,6 +126,23 @@ def fit_relative(
     some = evenly(ticks, _STATE_TICKS)
     parts = np.array_split(some, -(-len(some) // _AT_ONCE))
     return fit_channels(map(read, parts), "training actions relative to the state")
+
+
+def _refuse_without_state(store: FeatureStore, window_s: float | None) -> None:
+    """Raise `ConfigError` for a tick without a state in its window, of whichever side."""
+    ends = store.array("tick/state_end").astype(np.int64)
+    ticks = np.arange(store.ticks)
+    lacking = ends <= store.array("episode/state_start")[store.episode_of(ticks)]
+    if window_s is not None:
+        times = store.array("state/time")[np.maximum(ends - 1, 0)]
+        lacking |= store.array("tick/time") - times > window_s + CLOCK_SLACK_S
+    if lacking.any():
+        first = place(store, "tick", int(lacking.argmax()))
+        raise ConfigError(
+            "train_head.action_form: relative needs a state at every tick, within "
+            f"train_head.state_window_s, found none at {first}. Leave that episode out, or set "
+            "recorded."
+        )
 
 
 def _fit_state(store: FeatureStore, ticks: Ticks, windows: Windows) -> ChannelStatistics | None:

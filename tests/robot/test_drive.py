@@ -4,6 +4,7 @@ import sys
 import textwrap
 from collections.abc import Callable
 from functools import partial
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -167,6 +168,18 @@ def test_each_limit_stops_the_arm_and_the_run_is_kept(
         driven(limits)
     assert sys.modules["lerobot.robots.fake_arm"].Arm.ARMS[-1].log[-1] == "disconnect"
     assert [path.name for path in (tmp_path / "runs").glob("run_*")] == ["run_000000"]
+
+
+def test_an_arm_that_cannot_be_disconnected_does_not_hide_why_it_stopped(
+    lerobot: Any, driven: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def pulled(self: Any) -> None:
+        raise ConnectionError("no answer on the bus")
+
+    monkeypatch.setattr(import_module("lerobot.robots.fake_arm").Arm, "disconnect", pulled)
+    report, said = driven()
+    assert said[-1].startswith("time is up") and report.recording is not None
+    assert any("was not disconnected (no answer on the bus)" in line for line in said)
 
 
 def test_without_limits_it_warns(lerobot: Any, driven: Callable[..., Any]) -> None:

@@ -5,6 +5,7 @@ import os
 import subprocess
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from hashlib import sha256
 from importlib.util import find_spec
 from pathlib import Path
@@ -22,6 +23,7 @@ from pipeline.policy.checkpoint import PolicyCheckpoint
 from pipeline.policy.normalization import ChannelStatistics, Normalization
 from pipeline.policy.observation import PolicyShape
 from pipeline.policy.policy import Policy
+from pipeline.policy.shape import Anchor
 from pipeline.robot import export
 from pipeline.robot.export import (
     ExportedHead,
@@ -86,16 +88,19 @@ RARE: list[dict[str, Any]] = [
 
 
 def checkpoint_of(**changed: Any) -> PolicyCheckpoint:
-    """Of a policy whose every weight is heard."""
+    """Of a policy whose every weight is heard; that of `REGRESSION` counts from states."""
     params = TrainHeadParams.model_validate(SMALL | changed)
+    shape = SHAPE
+    if changed == REGRESSION:
+        shape = replace(SHAPE, anchors=(Anchor((0,), (0,)),), relative=(Anchor((1,), (1,)),))
     rng = np.random.default_rng(0)
     fitted = {
         name: ChannelStatistics(rng.normal(size=size), rng.uniform(0.5, 2.0, size), 100)
         for name, size in SHAPE.channels.items()
     }
-    normalization = Normalization(**fitted)
+    normalization = Normalization(**fitted, relative=fitted["action"] if shape.relative else None)
     torch.manual_seed(1)
-    state = Policy(params, SHAPE, normalization).state_dict()
+    state = Policy(params, shape, normalization).state_dict()
     kept = ("schedule",)
     weights = {
         name: value if name.split(".")[1] in kept else value + 0.1 * torch.randn(value.shape)
@@ -107,7 +112,7 @@ def checkpoint_of(**changed: Any) -> PolicyCheckpoint:
         "action_hz": 10.0,
         "vlm_reuse_count": 3,
     }
-    return PolicyCheckpoint(params, SHAPE, normalization, source, {}, 7, weights)
+    return PolicyCheckpoint(params, shape, normalization, source, {}, 7, weights)
 
 
 def exported(

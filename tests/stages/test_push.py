@@ -12,7 +12,7 @@ import pytest
 from huggingface_hub import HfApi
 
 from pipeline.base.config import load_params
-from pipeline.base.errors import HubError, StoreMismatch
+from pipeline.base.errors import ConfigError, HubError, StoreMismatch
 from pipeline.look.hub import push
 from pipeline.store import FeatureStore
 from stages import evaluate, rollout
@@ -28,7 +28,7 @@ class Hub(ThreadingHTTPServer):
         super().__init__(("127.0.0.1", 0), Answering)
         self.repos: dict[str, dict[str, bytes]] = {}
         self.made: list[dict[str, Any]] = []
-        self.full = False
+        self.full = self.public = False
 
     @property
     def api(self) -> HfApi:
@@ -37,6 +37,10 @@ class Hub(ThreadingHTTPServer):
 
 class Answering(BaseHTTPRequestHandler):
     server: Hub
+
+    def do_GET(self) -> None:
+        name = "/".join(self.path.split("/")[3:5])
+        self.answer({"id": name, "private": not self.server.public, "siblings": []})
 
     def do_POST(self) -> None:
         body = self.rfile.read(int(self.headers["Content-Length"]))
@@ -129,9 +133,15 @@ def test_the_card_alone_uploads_nothing(trained: Path, hub: Hub) -> None:
 def test_what_the_hub_refuses_and_what_cannot_be_pushed(
     trained: Path, hub: Hub, tmp_path: Path
 ) -> None:
-    hub.full = True
+    hub.public = True
+    with pytest.raises(HubError, match="is there and public"):
+        push(load_params(trained, ["push.repo=lab/needle"]), hub.api)
+    assert hub.repos == {}
+    hub.public, hub.full = False, True
     with pytest.raises(HubError, match="lab/needle"):
         push(load_params(trained, ["push.repo=lab/needle"]), hub.api)
+    with pytest.raises(ConfigError, match="owner/name"):
+        push(load_params(trained, ["push.repo=needle"]), hub.api)
     with pytest.raises(StoreMismatch, match=r"push\.folder"):
         push(load_params(trained, ["push.repo=a/b", f"push.folder={tmp_path}"]), hub.api)
 

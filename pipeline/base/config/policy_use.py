@@ -180,7 +180,7 @@ class PushParams(Section):
     repo: str = ""
     """The repository, as owner/name. It is made if there is none."""
     folder: Place | None = None
-    """A trained policy, a finished store or an archive. null: `train_head.output`."""
+    """A trained policy or a finished store. null: `train_head.output`."""
     private: bool = True
     """Whether a new repository is private. A policy carries a few camera frames (golden rows), a
     store all streams: look at them before you publish."""

@@ -203,8 +203,9 @@ class TrainHeadParams(Section):
     how far. none: no channel."""
     action_form: Literal["recorded", "relative"] = "recorded"
     """relative: absolute actions that the state measures too (`joint_1`, `x` or `pose_x`, in the
-    same unit) are learned as differences from the state at the tick, with statistics of their own;
-    pose angles as a rotation from it. The store and the policy's answers stay absolute."""
+    same unit) are learned as differences from the state at the tick, with statistics of their own,
+    all but the angles of a pose. The store and the policy's answers stay absolute. Every episode
+    needs a state."""
     anchor_s: float = Field(default=2.0, gt=0, le=3600)
     """Most seconds that the motion since a frame is known; an older frame counts as this old."""
     sensor_lag_s: float = Field(default=0.0, ge=0, le=3600)
