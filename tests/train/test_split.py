@@ -187,9 +187,9 @@ class TestSides:
         keys = [i // 2 for i in range(len(lengths))] if paired else None
         store = FakeStore(lengths, keys, sources="abc"[:sources])
         val, test = shares
+        if paired and len(lengths) < 5:
+            return  # fewer than three groups, which may be refused as too short to cut
         split = drawn(store, 1, val=val, test=test, seed=seed)
-        if len(set(split.groups.values())) < 3:
-            return
         sides, asked = sides_of(store, split), {"train"}
         asked |= {side for side, share in (("val", val), ("test", test)) if share}
         assert set(sides.values()) == asked
