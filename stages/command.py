@@ -9,7 +9,7 @@ import signal
 import sys
 from collections.abc import Callable, Generator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Any
@@ -33,7 +33,6 @@ class Shorthand:
     """The name of the value in the help; None for an option without a value, which means true."""
     nargs: str | None = None
     """As in argparse: `"*"` takes a list; with `"?"` the value may be left out and is then true."""
-
     repeated: bool = False
     """Whether commands that a message advises to run next need it, too."""
 
@@ -59,34 +58,27 @@ class Shorthand:
 
 
 _SHORT = {
-    "--data": ("root", "the folder of the recordings", "FOLDER"),
-    "--views": ("views", "the cameras to use", "VIEW"),
-    "--store": ("store", "the store", "FOLDER"),
-    "--checkpoint": ("checkpoint", "a trained policy", "FOLDER"),
-    "--expert": ("model_type", "regression, diffusion or flow_matching", "NAME"),
-    "--lr": ("lr", "learning rate", "RATE"),
-    "--steps": ("max_steps", "optimizer steps", "N"),
-    "--batch": ("batch_size", "samples or rows at a time", "N"),
-    "--device": ("device", "auto, cpu or cuda:N", "NAME"),
-    "--out": ("output", "the folder to write", "FOLDER"),
+    option.name: option
+    for option in (
+        Shorthand("--data", "root", "the folder of the recordings", "FOLDER"),
+        Shorthand("--views", "views", "the cameras to use", "VIEW", "+"),
+        Shorthand("--store", "store", "the store", "FOLDER"),
+        Shorthand("--checkpoint", "checkpoint", "a trained policy", "FOLDER"),
+        Shorthand("--expert", "model_type", "regression, diffusion or flow_matching", "NAME"),
+        Shorthand("--lr", "lr", "learning rate", "RATE"),
+        Shorthand("--steps", "max_steps", "optimizer steps", "N"),
+        Shorthand("--batch", "batch_size", "samples or rows at a time", "N"),
+        Shorthand("--device", "device", "auto, cpu or cuda:N", "NAME"),
+        Shorthand("--out", "output", "the folder to write", "FOLDER"),
+    )
 }
-"""Options that several commands have: the key in the command's section, and its help."""
+"""Options that several commands have, each with its key in the command's section."""
 
 
 def short(section: str, *options: str) -> tuple[Shorthand, ...]:
     """Options for the keys of a section that people set most often."""
-    return tuple(
-        Shorthand(
-            option,
-            f"{section}.{key}",
-            text,
-            value,
-            "+" if option == "--views" else None,
-            repeated=True,
-        )
-        for option in options
-        for key, text, value in [_SHORT[option]]
-    )
+    chosen = (_SHORT[option] for option in options)
+    return tuple(replace(o, key=f"{section}.{o.key}", repeated=True) for o in chosen)
 
 
 def run(
@@ -132,9 +124,10 @@ def _run(
         if options.keys:
             print("\n".join(described_keys(sections or tuple(Params.model_fields))))
         else:
-            given = [(short, pair) for short in shorthands for pair in short.override(options)]
-            params = load_params(options.params, [*options.overrides, *(pair for _, pair in given)])
-            repeated = [pair for short, pair in given if short.repeated]
+            given = [pair for shorthand in shorthands for pair in shorthand.override(options)]
+            params = load_params(options.params, [*options.overrides, *given])
+            again = (shorthand for shorthand in shorthands if shorthand.repeated)
+            repeated = [pair for shorthand in again for pair in shorthand.override(options)]
             with running_with(options.params, [*options.overrides, *repeated]):
                 work(params)
         sys.stdout.flush()  # here, where an error is handled: at the interpreter's exit it is not

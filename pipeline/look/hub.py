@@ -7,8 +7,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pipeline.base.config import Params
-from pipeline.base.errors import ConfigError, HubError, StoreMismatch
+from pipeline.base.errors import CheckpointIncomplete, ConfigError, HubError, StoreMismatch
 from pipeline.base.text import Table
+from pipeline.evaluate.figures import Figure, with_unit
+from pipeline.evaluate.rollouts import SuccessRate
 from pipeline.policy.checkpoint import DOCUMENT, PolicyCheckpoint, find_policy, load_policy
 from pipeline.store import FeatureStore
 from pipeline.vlm.checkpoint_folder import could_be_hub_id, folder_here
@@ -35,16 +37,17 @@ def push(params: Params, api: "HfApi", say: Callable[[str], None] = print) -> No
     if (folder / "zarr.json").exists():
         kind, files = "dataset", _files_below(folder)
         card = store_card(FeatureStore.open(folder), wanted.repo)
-    elif any((place / DOCUMENT).exists() for place in (folder, folder / "best")):
-        folder = find_policy(folder)
+    else:
+        try:
+            folder = find_policy(folder)
+        except CheckpointIncomplete as error:
+            raise StoreMismatch(
+                f"push.folder: {folder}: expected a trained policy or a finished store. Run "
+                "stages.train_head, or name another folder"
+            ) from error
         kind, files = "model", _files_below(folder)
         reports = {"evaluate": params.evaluate.output, "rollout": params.rollout.output}
         card = policy_card(load_policy(folder), wanted.repo, params.vlm.checkpoint, reports)
-    else:
-        raise StoreMismatch(
-            f"push.folder: {folder}: expected a trained policy or a finished store. Run "
-            "stages.train_head, or name another folder"
-        )
     if wanted.card_only:
         say(card)
         largest = sorted(files.items(), key=lambda file: -file[1][1])
@@ -210,10 +213,7 @@ def _facts(about: Mapping[str, str]) -> list[str]:
 
 def _channels(stream: Mapping[str, Any]) -> str:
     """The names and units of a stream's channels, the first of many."""
-    pairs = [
-        f"{n} [{unit}]" if unit else n
-        for n, unit in zip(stream["names"], stream["units"], strict=True)
-    ]
+    pairs = [*map(with_unit, stream["names"], stream["units"])]
     return ", ".join(pairs) if len(pairs) <= 30 else f"{len(pairs)}: {', '.join(pairs[:5])}, …"
 
 
@@ -226,10 +226,7 @@ def _judged(checkpoint: PolicyCheckpoint, reports: Mapping[str, Path]) -> Iterat
             f"`{rollout['level']}`, with 95 % intervals:"
         )
         yield ""
-        rows = [
-            (name, f"{rate['rate']:.0%} ({rate['low']:.0%} to {rate['high']:.0%})")
-            for name, rate in metrics["success"].items()
-        ]
+        rows = [(name, str(SuccessRate(**rate))) for name, rate in metrics["success"].items()]
         yield from Table(("controller", "success"), rows).markdown()
     judged, metrics = (_document(reports["evaluate"], name) for name in ("judged", "metrics"))
     if judged.get("policy", {}).get("weights") == checkpoint.digest:
@@ -238,7 +235,7 @@ def _judged(checkpoint: PolicyCheckpoint, reports: Mapping[str, Path]) -> Iterat
         yield f"Errors on {held_out['episodes']} held-out episodes, beside the best simple rule:"
         yield ""
         rows = [
-            (span, group, *(_interval(by[name]) for name in ("policy", "best_baseline")))
+            (span, group, *(Figure(**by[name]).text() for name in ("policy", "best_baseline")))
             for span in ("executed", "chunk")
             for group, by in metrics[span].items()
             if "best_baseline" in by
@@ -250,8 +247,3 @@ def _document(folder: Path, name: str) -> dict[str, Any]:
     """A JSON document of a report; empty where there is none."""
     path = folder / f"{name}.json"
     return json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
-
-
-def _interval(figure: Mapping[str, float]) -> str:
-    value = f"{figure['value']:.3g}"
-    return f"{value} ({figure['low']:.3g} to {figure['high']:.3g})" if "low" in figure else value

@@ -60,7 +60,7 @@ def write_episodes(subject: Subject, params: Params) -> list[Path]:
 
 
 def _spread(total: int, count: int) -> list[int]:
-    return np.unique(np.linspace(0, total - 1, min(total, count)).round().astype(int)).tolist()
+    return np.linspace(0, total - 1, min(total, count)).round().astype(int).tolist()
 
 
 def _shown(chosen: Sequence[Any]) -> "tqdm[Any]":

@@ -132,10 +132,7 @@ class PolicyDocument(SourceDocument):
             raise ValueError(
                 "normalization.relative: expected it just where shape.relative has some"
             )
-        sizes = shape.channels
-        if shape.relative:
-            sizes["relative"] = sizes["action"]
-        for stream, size in sizes.items():
+        for stream, size in shape.channels.items():
             fitted = getattr(self.normalization, stream)
             actual = fitted and (fitted.mean.shape, fitted.std.shape)
             if actual != (size, size) and not (fitted is None and 0 in size):

@@ -172,13 +172,18 @@ class PolicyShape:
 
     @property
     def channels(self) -> dict[str, tuple[int, ...]]:
-        """The shape of each stream's statistics and of the action's; states are expanded."""
+        """The shape of each stream's statistics and of the action's; states are expanded.
+
+        With `relative` there are also those of the chunks that the policy learns.
+        """
         expanded = expanded_names([""] * self.state_dim, self.kinds)
+        learned = {"relative": (self.action_dim,)} if self.relative else {}
         return {
             "features": (self.slots, self.feature_dim),
             "sensor": (self.sensor_channels,),
             "state": (len(expanded),),
             "action": (self.action_dim,),
+            **learned,
         }
 
     def anchored(self, names: Sequence[str]) -> list[str]:

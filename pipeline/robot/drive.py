@@ -14,6 +14,7 @@ from typing import Any
 from pydantic import TypeAdapter, ValidationError
 from tqdm import tqdm
 
+from pipeline.base.border import problems
 from pipeline.base.config import DriveParams, Params
 from pipeline.base.errors import ConfigError, RobotStopped
 from pipeline.robot.client import TOKEN_VARIABLE, PolicyClient, refuse_other_robot
@@ -160,11 +161,8 @@ def _settings(wanted: DriveParams) -> RunSettings:
     try:
         return TypeAdapter(RunSettings).validate_python(given)
     except ValidationError as error:
-        first = error.errors()[0]
-        place = ".".join(map(str, first["loc"]))
-        raise ConfigError(
-            f"drive.settings.{place}: {first['msg']}, found {first['input']!r}"
-        ) from None
+        wrong = (f"drive.settings.{place}: {why}" for place, why in problems(error))
+        raise ConfigError("; ".join(wrong)) from None
 
 
 def _with_instruction(settings: RunSettings, known: Sequence[str]) -> RunSettings:

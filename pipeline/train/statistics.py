@@ -1,6 +1,6 @@
 """The normalisation, fitted on the training ticks alone."""
 
-from collections.abc import Generator, Iterable, Sequence
+from collections.abc import Generator, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, replace
 from functools import partial
@@ -21,7 +21,7 @@ from pipeline.policy.attention import right_aligned
 from pipeline.policy.normalization import Block, ChannelStatistics, Normalization, fit_channels
 from pipeline.policy.robot_state import RelativeActions, expand
 from pipeline.policy.shape import PolicyShape, channel_kinds, expanded_names, told_deltas
-from pipeline.store import FeatureStore, place
+from pipeline.store import Batch, FeatureStore, place
 from pipeline.train.batches import Ticks, Windows, evenly
 
 CHUNK_BYTES = 64 * 2**20
@@ -116,16 +116,13 @@ def fit_relative(
         return None
     _refuse_without_state(store, windows.state_window_s)
     relative = RelativeActions(shape.relative, shape.kinds)
-    seen = replace(windows, sensor_window=1)
 
-    def read(part: Ticks) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-        batch = store.gather(part, **asdict(seen))
+    def read(batch: Batch) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
         chunk = relative.from_absolute(batch.action, batch)
         return chunk.flatten(0, 1).numpy(), batch.action_valid.flatten().numpy() > 0
 
-    some = evenly(ticks, _STATE_TICKS)
-    parts = np.array_split(some, -(-len(some) // _AT_ONCE))
-    return fit_channels(map(read, parts), "training actions relative to the state")
+    batches = _some_batches(store, ticks, replace(windows, sensor_window=1))
+    return fit_channels(map(read, batches), "training actions relative to the state")
 
 
 def _refuse_without_state(store: FeatureStore, window_s: float | None) -> None:
@@ -151,22 +148,26 @@ def _fit_state(store: FeatureStore, ticks: Ticks, windows: Windows) -> ChannelSt
         return None
     channels = _channels(store, "state")
     kinds = channel_kinds(**channels)
-    some = evenly(ticks, _STATE_TICKS)
-    seen = replace(windows, horizon=1, sensor_window=1)
+    batches = _some_batches(store, ticks, replace(windows, horizon=1, sensor_window=1))
 
-    def read(part: Ticks) -> NDArray[np.float32]:
-        batch = store.gather(part, **asdict(seen))
+    def read(batch: Batch) -> NDArray[np.float32]:
         real = right_aligned(batch.state_valid, batch.state.shape[1])
         return expand(batch.state, kinds)[real].numpy()
 
-    parts = np.array_split(some, -(-len(some) // _AT_ONCE))
-    blocks = (block for part in parts if len(block := read(part)))
+    blocks = (block for batch in batches if len(block := read(batch)))
     if (first := next(blocks, None)) is None:
         return None  # all readings are older than the window
     with _place_named(store, "state", readings):
         fitted = fit_channels(chain([first], blocks), _NAMES["state"])
     names = expanded_names(channels["names"], kinds)
     return _floored(fitted, names, [""] * len(names))
+
+
+def _some_batches(store: FeatureStore, ticks: Ticks, windows: Windows) -> Iterator[Batch]:
+    """What at most `_STATE_TICKS` of these ticks see, evenly spread, a few at a time."""
+    some = evenly(ticks, _STATE_TICKS)
+    for part in np.array_split(some, -(-len(some) // _AT_ONCE)):
+        yield store.gather(part, **asdict(windows))
 
 
 def _channels(store: FeatureStore, stream: str) -> dict[str, list[str]]:

@@ -1,4 +1,4 @@
-"""Chunks that count from the newest frame."""
+"""Chunks that count from a state: that at the newest frame, or that at the tick."""
 
 from dataclasses import replace
 
@@ -11,8 +11,8 @@ from pipeline.base.config import TrainHeadParams
 from pipeline.base.errors import ConfigError
 from pipeline.base.observation import Observation
 from pipeline.policy.expert import Guide
-from pipeline.policy.robot_state import Anchoring, state_at_frame
-from pipeline.policy.shape import Anchor, channel_kinds, find_anchors
+from pipeline.policy.robot_state import Anchoring, RelativeActions, state_at_frame
+from pipeline.policy.shape import Anchor, channel_kinds, find_anchors, find_relative
 from pipeline.robot.export import Head, trace
 
 POSE = {
@@ -24,6 +24,11 @@ ROTVEC = {
     "kind": "delta",
     "names": ["dx", "dy", "dz", "rx", "ry", "rz", "gripper"],
     "units": ["mm"] * 3 + ["deg"] * 3 + [""],
+}
+ABSOLUTE = {
+    "kind": "absolute",
+    "names": ["x", "y", "z", "a", "b", "r", "gripper", "joint_1"],
+    "units": ["mm"] * 3 + ["deg"] * 3 + ["", "rad"],
 }
 START = torch.tensor([3.1, 5.0, -4.0, 0.0, 20.0, 10.0, 179.0])
 SPEED = torch.tensor([2.0, 10.0, -3.0, 1.0, 30.0, 20.0, 40.0])
@@ -158,3 +163,41 @@ def test_an_exported_head_counts_likewise(build_policy, observe, shape):
     program = trace(head, fields).module()
     other = {name: getattr(observe(3), name) for name in fields}
     torch.testing.assert_close(program(**other), head(**other))
+
+
+@pytest.fixture
+def anywhere(observe):
+    seen = observe(4, 13, 5)
+    state = torch.randn(*seen.state.shape[:2], 7) * torch.tensor([2.0, 50, 50, 50, 170, 80, 170])
+    return replace(seen, state=state)
+
+
+def test_each_step_counts_from_the_state_and_back(anywhere):
+    relative = RelativeActions(find_relative(ABSOLUTE, POSE), KINDS)
+    chunks = torch.randn(2, 4, 8, 8) * torch.tensor([50.0, 50, 50, 60, 40, 60, 1, 1])
+    learned, now = relative.from_absolute(chunks, anywhere), anywhere.state[:, -1]
+    difference = chunks[..., :3] - now[:, None, 1:4]
+    torch.testing.assert_close(learned[..., :3], difference, atol=1e-4, rtol=0)
+    assert learned[..., 7].abs().max() <= torch.pi + 1e-5  # the short way round
+    assert learned[..., 3:7].equal(chunks[..., 3:7])  # angles of a pose, and what it lacks
+    change = relative.to_absolute(learned, anywhere) - chunks
+    turn = torch.tensor([torch.inf] * 7 + [2 * torch.pi])
+    rest = torch.where(turn.isinf(), change, change - turn * (change / turn).round())
+    assert rest.abs().max() < 2e-2
+
+
+def test_without_a_state_the_answer_is_no_number(anywhere):
+    relative = RelativeActions(find_relative(ABSOLUTE, POSE), KINDS)
+    blind = replace(anywhere, state_valid=torch.tensor([5, 5, 0, 5]))
+    answer = relative.to_absolute(torch.zeros(4, 8, 8), blind)
+    assert answer[2, :, :3].isnan().all() and answer[[0, 1, 3]].isfinite().all()
+
+
+@pytest.mark.parametrize(
+    "action",
+    [ABSOLUTE | {"kind": "delta"}, {"kind": "absolute", "names": ["x"], "units": ["m"]}],
+    ids=["deltas", "another unit"],
+)
+def test_what_the_state_does_not_measure_is_refused(action):
+    with pytest.raises(ConfigError, match=r"train_head\.action_form"):
+        find_relative(action, POSE)
