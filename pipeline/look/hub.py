@@ -119,11 +119,11 @@ def policy_card(
     action = streams["action"]
     about = {
         "action expert": f"{params.model_type}, fusion {params.fusion_strategy}",
-        "actions": f"{params.horizon} steps of {_channels(action)}, {action['kind']}",
+        "actions": f"{params.horizon} steps of {_channels(streams, 'action')}, {action['kind']}",
         "rate": f"{source['action_hz']:g} Hz" if source["action_hz"] else "as recorded",
         "cameras": ", ".join(streams["views"]),
-        "state": _channels(streams["state"]) if "state" in streams else "none",
-        "sensor": _channels(streams["sensor"]) if "sensor" in streams else "none",
+        "state": _channels(streams, "state"),
+        "sensor": _channels(streams, "sensor"),
         "instructions": "; ".join(checkpoint.instructions),
         "trained on": f"{len(checkpoint.split['train'])} episodes, {checkpoint.step} steps",
     }
@@ -158,11 +158,7 @@ def store_card(store: FeatureStore, repo: str) -> str:
         "ticks": f"{store.ticks:,}",
         "features": f"{slots} slots of {dim} in {spec['storage_dtype']}",
         "feature spec": f"`{spec['digest']}`",
-        **{
-            name: _channels(streams[name])
-            for name in ("action", "state", "sensor")
-            if name in streams
-        },
+        **{name: _channels(streams, name) for name in ("action", "state", "sensor")},
     }
     folder = f"cache_store/{repo.split('/')[-1]}.zarr"
     lines = [
@@ -211,8 +207,11 @@ def _facts(about: Mapping[str, str]) -> list[str]:
     return Table(("", " "), list(about.items())).markdown()
 
 
-def _channels(stream: Mapping[str, Any]) -> str:
-    """The names and units of a stream's channels, the first of many."""
+def _channels(streams: Mapping[str, Any], name: str) -> str:
+    """The names and units of a stream's channels, the first of many; a store may lack it."""
+    stream = streams.get(name)
+    if not stream or not stream["names"]:
+        return "none"
     pairs = [*map(with_unit, stream["names"], stream["units"])]
     return ", ".join(pairs) if len(pairs) <= 30 else f"{len(pairs)}: {', '.join(pairs[:5])}, …"
 

@@ -2,7 +2,7 @@
 
 import base64
 import json
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from threading import Thread
@@ -13,7 +13,7 @@ from huggingface_hub import HfApi
 
 from pipeline.base.config import load_params
 from pipeline.base.errors import ConfigError, HubError, StoreMismatch
-from pipeline.look.hub import push
+from pipeline.look.hub import push, store_card
 from pipeline.store import FeatureStore
 from stages import evaluate, rollout
 from stages.command import run
@@ -120,6 +120,13 @@ def test_a_store_comes_back_as_it_was(trained: Path, hub: Hub, tmp_path: Path) -
         (tmp_path / "back" / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / "back" / name).write_bytes(content)
     assert FeatureStore.open(tmp_path / "back").spec == FeatureStore.open(store).spec
+
+
+def test_a_stream_that_is_not_there_is_said_to_be_none(
+    tiny_store: Callable[..., Path], tmp_path: Path
+) -> None:
+    card = store_card(FeatureStore.open(tiny_store(tmp_path, sensor_channels=0)), "lab/store")
+    assert "| sensor | none |" in card and "| state | joint_0, joint_1" in card
 
 
 def test_the_card_alone_uploads_nothing(trained: Path, hub: Hub) -> None:
