@@ -16,7 +16,6 @@ from pathlib import Path, PurePath, PurePosixPath, PureWindowsPath
 from typing import Annotated, Any
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import AfterValidator, BeforeValidator, Field, InstanceOf, Strict
 
 from pipeline.base.border import Document, Text, shown
@@ -53,7 +52,7 @@ ACTION = Channels(
     ("dx", "dy", "dz", "da", "db", "dr", "gripper"), ("mm",) * 3 + ("deg",) * 3 + ("",)
 )
 _DTYPE = re.compile(r"[<>=|]?(\?|[biuf][1248]|[SU]\d{1,6})")
-_PickledArray = Annotated[InstanceOf[NDArray[Any]], AfterValidator(np.asarray)]
+_PickledArray = Annotated[InstanceOf[np.ndarray], AfterValidator(np.asarray)]
 
 
 class _Metadata(Document):
