@@ -88,12 +88,13 @@ def test_short_options_set_keys_and_are_repeated_in_what_a_message_advises():
     def work(params):
         seen.append((params.train_head.lr, params.data.views, advised("evaluate")))
 
-    options = (*short("train_head", "--lr"), *short("data", "--views"))
-    arguments = ["--params", PARAMS, "--lr", "1e-3", "--views", "View1", "View2"]
+    options = (*short("train_head", "--lr", "--steps"), *short("data", "--views"))
+    arguments = ["--params", PARAMS, "--lr", "1e-3", "--steps", "8", "--views", "View1", "View2"]
     assert run("Summary.", work, arguments, options) == 0
     ((lr, views, printed),) = seen
     assert (lr, views) == (1e-3, ("View1", "View2"))
-    assert "--set train_head.lr=1e-3" in printed and "data.views" in printed
+    assert "--set train_head.lr=1e-3" in printed and "train_head.max_steps=8" in printed
+    assert "data.views" in printed
 
 
 @pytest.mark.parametrize("folder", ["2026", "1e3", "null", "yes", "2026-11-26", "a b", "plain"])
