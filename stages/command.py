@@ -17,6 +17,8 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from pipeline.base.config import Params
 
+_NUMBERS = ("N", "RATE", "S")
+"""Names of values that are numbers; the value of every other option stays text."""
 STOPPED = "stopped; run the same command again"
 
 
@@ -52,9 +54,15 @@ class Shorthand:
         value: Any = getattr(options, self.name.lstrip("-"))
         if value is None or value == []:
             return []
-        # A plain word stays as typed, so that 8 is a number; YAML must not interpret other text.
-        word = isinstance(value, str) and re.fullmatch(r"[\w.+-]+", value)
-        return [f"{self.key}={value if word else json.dumps(value)}"]
+        return [f"{self.key}={value if self._stays(value) else json.dumps(value)}"]
+
+    def _stays(self, value: Any) -> bool:
+        """Whether a value is laid over as typed: a number, or a word that YAML reads as itself."""
+        if not isinstance(value, str) or not re.fullmatch(r"[\w.+-]+", value):
+            return False
+        from yaml import safe_load
+
+        return self.value in _NUMBERS or safe_load(value) == value
 
 
 _SHORT = {

@@ -14,6 +14,7 @@ from pipeline.base.commands import command
 from pipeline.base.config import Source
 from pipeline.base.errors import RecordingError
 from pipeline.data import lerobot, pickled, raw, windowed
+from pipeline.data.hub import hub_folder
 from pipeline.data.recording import Recording, absolute, entries, natural_key
 
 Opener = Callable[[Path, Source, Sequence[str] | None], tuple[Sequence[Recording], Sequence[str]]]
@@ -54,8 +55,7 @@ _FOREIGN = {
 """Formats without a reader, by file name patterns; the first match decides."""
 
 _ON_THE_HUB = (
-    "A data set on the Hugging Face hub has to lie here first: hf download --repo-type dataset "
-    "ORG/NAME --local-dir FOLDER"
+    "For a data set on the Hugging Face Hub, give the source hub: owner/name in place of path"
 )
 
 _ODD = re.compile(r"[\x00-\x1f\x7f\ud800-\udfff]")
@@ -73,7 +73,7 @@ def episode_folders(source: Source, root: Path) -> list[tuple[Path, FormatReader
     characters, because a store could not keep it.
     """
     unique: dict[Path, tuple[Path, FormatReader]] = {}
-    for pattern in source.paths:
+    for pattern in source.paths if source.hub is None else [str(hub_folder(source))]:
         full = absolute(root / pattern)
         matches = _matches(full)
         if not matches:

@@ -151,6 +151,8 @@ def _executor(surveyed: Survey) -> Executor:
 
 def _survey_lines(surveyed: Survey) -> Iterator[str]:
     for source in surveyed.data.sources:
+        if source.hub is not None:
+            yield f"source {source.name!r}: {source.hub} is on the Hub, so DVC does not watch it"
         for path in source.paths:
             if Path(path).is_absolute():
                 yield f"source {source.name!r}: {path} is absolute, so DVC does not watch it"

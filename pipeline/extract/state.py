@@ -25,6 +25,7 @@ from pipeline.base.text import duration, size
 from pipeline.data.episode import Embodiment
 from pipeline.extract.survey import CheckedEpisode, Survey
 from pipeline.store import FEATURES, RowSource, StoreBuild, part_path, read_plan
+from pipeline.store.border import gc_command
 from pipeline.store.paths import KEPT, MERGED, builds_aside, previous_path, set_build_aside
 from pipeline.store.schema import ArraySpec, read_specs
 
@@ -90,11 +91,12 @@ class StorePlaces:
         return StorePlaces(self.target)
 
     def keeping_note(self, surveyed: Survey) -> list[str]:
-        """What happens to the store and the previous one if the run lacks some of their episodes.
+        """What happens to the store and the previous one if the run lacks some of their rows.
 
         Raises `ConfigError` where something else lies in the previous store's place.
         """
         lost, contents, lines = self._lost(surveyed), surveyed.contents, list[str]()
+        other = lost is None and self._has_other_episodes(surveyed)
         if lost and self.finished:
             refuse_foreign(self.previous, KEPT)
             lines.append(
@@ -102,10 +104,17 @@ class StorePlaces:
                 "successful run, which takes their rows from it where they are there again"
             )
             contents |= set(_contents(self.target) or ())
+        if other:
+            refuse_foreign(self.previous, KEPT)
+            lines.append(
+                f"{self.target} is kept as {self.previous}, and takes its place on the disk, if it "
+                "holds rows that the new store lacks"
+            )
         if self.kept:
             known = _contents(self.previous)
             fate = "kept" if lost else "removed"
             fate = "replaced by it" if lost and self.finished else fate
+            fate = "removed, or replaced by it," if other else fate
             gone = "all its" if known is None else sum(content not in contents for content in known)
             lines.append(
                 f"{self.previous} is {fate} when this run succeeds; {gone} episode(s) are only in "
@@ -114,18 +123,42 @@ class StorePlaces:
         return lines
 
     def put_in_place(self, build: StoreBuild, surveyed: Survey, say: Say) -> None:
-        """Seal a build; keep the replaced store if it has episodes that the build lacks."""
-        keep = self._lost(surveyed) is not None
+        """Seal a build; keep the replaced store if it has episodes or rows that the build lacks."""
+        keep = self._lost(surveyed) is not None or self._has_other_rows(surveyed, self.part)
         build.seal(keep=keep)
         if keep:
-            say(f"{self.previous}: the store before, kept until the next successful run")
+            taken = size(store_bytes(read_specs(self.previous)))
+            say(
+                f"{self.previous}: the store before, {taken} with what both share, kept for its "
+                "rows until the next run that changes the store; "
+                f"{gc_command(self.previous)} removes it"
+            )
         elif self.kept:
             remove_folder(self.previous, KEPT)
 
     def drop_previous(self, surveyed: Survey) -> None:
-        """Remove a previous store that a kill left, if the run has all its episodes."""
-        if self.kept and {*(_contents(self.previous) or [""])} <= surveyed.contents:
+        """Remove a previous store that a kill left, if the store has all its episodes and rows."""
+        if not self.kept or not {*(_contents(self.previous) or [""])} <= surveyed.contents:
+            return
+        if not _keys(self.previous) - _keys(self.target):
             remove_folder(self.previous, KEPT)
+
+    def _has_other_episodes(self, surveyed: Survey) -> bool:
+        """Whether the store may have rows that this run does not make."""
+        if self.finished in (None, surveyed.plan) or self.repaired:
+            return False
+        store, here = RowSource(self.target), {episode.digest for episode in surveyed.episodes}
+        other_spec = store.attributes.feature_spec.digest != surveyed.spec.digest
+        return other_spec or not {text.digest for text in store.texts} <= here
+
+    def _has_other_rows(self, surveyed: Survey, build: Path) -> bool:
+        """Whether the store to be replaced has rows that a complete build lacks.
+
+        A store under repair counts as without rows: its damage must not come back.
+        """
+        if not self.stores or read_plan(self.stores[0]) == surveyed.plan or self.repaired:
+            return False
+        return bool(_keys(self.stores[0]) - _keys(build))
 
     def _lost(self, surveyed: Survey) -> str | None:
         """Which episodes of the existing store are not in this run; None if all are."""
@@ -194,6 +227,14 @@ def _contents(store: Path) -> list[str] | None:
         return [text.content for text in RowSource(store).texts]
     except StoreIncomplete:
         return None
+
+
+def _keys(store: Path) -> set[bytes]:
+    """The key of each row of a store or a build; none where they can no longer be read."""
+    try:
+        return set(RowSource(store).rows)
+    except StoreIncomplete:
+        return set()
 
 
 def spec_differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:

@@ -1,19 +1,19 @@
 """A policy or a store on the Hugging Face Hub: a card made of its own figures, and the upload."""
 
 import json
-import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pipeline.base.config import Params
 from pipeline.base.errors import CheckpointIncomplete, ConfigError, HubError, StoreMismatch
+from pipeline.base.hub import could_be_hub_id, network_errors
 from pipeline.base.text import Table
 from pipeline.evaluate.figures import Figure, with_unit
 from pipeline.evaluate.rollouts import SuccessRate
 from pipeline.policy.checkpoint import DOCUMENT, PolicyCheckpoint, find_policy, load_policy
 from pipeline.store import FeatureStore
-from pipeline.vlm.checkpoint_folder import could_be_hub_id, folder_here
+from pipeline.vlm.checkpoint_folder import folder_here
 
 if TYPE_CHECKING:
     from huggingface_hub import HfApi
@@ -91,19 +91,13 @@ def _upload(
         )
     except HubError:
         raise
-    except (HfHubHTTPError, HFValidationError, LocalTokenNotFoundError, *_network()) as error:
+    except (HfHubHTTPError, HFValidationError, LocalTokenNotFoundError, *network_errors()) as error:
         why = (str(error).strip() or type(error).__name__).splitlines()[0]
         raise HubError(
             f"push.repo: {repo}: {why}. Log in with a token that may write (hf auth login), and "
             "name a repository of yours as owner/name"
         ) from error
     return commit.commit_url
-
-
-def _network() -> tuple[type[Exception], ...]:
-    """The errors of a network that fails; releases of huggingface_hub differ in their client."""
-    clients: list[Any] = [sys.modules[name] for name in ("httpx", "httpx2") if name in sys.modules]
-    return OSError, *(client.TransportError for client in clients)
 
 
 def policy_card(

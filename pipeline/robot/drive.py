@@ -21,6 +21,7 @@ from pipeline.robot.client import TOKEN_VARIABLE, PolicyClient, refuse_other_rob
 from pipeline.robot.lerobot_arm import LeRobotArm
 from pipeline.robot.limits import Limits
 from pipeline.robot.loop import StopKind, check_chunking
+from pipeline.robot.process import ended_by_hand
 from pipeline.robot.realtime import PolicySession, Robot, RunSettings, run_robot
 from pipeline.robot.recorder import RunRecorder
 from pipeline.robot.run_report import RunReport
@@ -47,7 +48,7 @@ def drive(params: Params, say: Callable[[str], None] = print) -> RunReport:
         limits = None if wanted.limits is None else Limits.read(wanted.limits, policy.metadata, hz)
         if limits is None:
             say("warning: without drive.limits any action of the policy is sent to the robot")
-        check_chunking(settings.chunking, policy.metadata["stochastic"])
+        check_chunking(settings.chunking, policy.metadata["stochastic"], "drive.settings")
         arm = _connected(robot, wanted, policy.metadata)
         recorder = None
         if wanted.runs is not None:
@@ -113,14 +114,19 @@ def _lerobot_robot(kind: str, config: Mapping[str, Any]) -> Any:
 
 @contextmanager
 def _left(robot: Any, say: Callable[[str], None]) -> Generator[Any]:
-    """The robot; afterwards it is disconnected or closed, and a failure of that is only printed."""
+    """The robot; afterwards it is disconnected or closed, and a failure of that is only printed.
+
+    Meanwhile Ctrl-C interrupts nothing, so that a second one does not leave the robot connected.
+    """
     try:
         yield robot
     finally:
         leave = getattr(robot, "disconnect", None) or getattr(robot, "close", None)
         if leave is not None and getattr(robot, "is_connected", True):
             try:
-                leave()
+                with ended_by_hand() as signals:
+                    signals.append("")  # From here on a signal interrupts nothing.
+                    leave()
             except Exception as error:  # What ended the run must still be told.
                 say(f"warning: the robot was not disconnected ({error}): see that it stands still")
 

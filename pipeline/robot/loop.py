@@ -111,11 +111,17 @@ class Executor:
     """
 
     def __init__(
-        self, chunking: "Chunking", execute: int, horizon: int, moving: ArrayLike | None = None
+        self,
+        chunking: "Chunking",
+        execute: int,
+        horizon: int,
+        moving: ArrayLike | None = None,
+        section: str = "rollout",
     ) -> None:
+        """`section` has the keys that a message names."""
         if not 1 <= execute <= horizon:
             raise ConfigError(
-                f"rollout.execute: expected 1 to {horizon}, the steps of a chunk "
+                f"{section}.execute: expected 1 to {horizon}, the steps of a chunk "
                 f"(train_head.horizon), found {execute}"
             )
         self.chunking: "Chunking" = chunking
@@ -309,11 +315,14 @@ def soft_mask(horizon: int, delay: int, overlap: int) -> Steps:
     return np.where(step < delay, 1, np.where(step < overlap, falling, 0)).astype(np.float32)
 
 
-def check_chunking(chunking: "Chunking", stochastic: bool) -> None:
-    """Raise `ConfigError` for `rtc` with a policy that samples nothing to guide."""
+def check_chunking(chunking: "Chunking", stochastic: bool, section: str = "rollout") -> None:
+    """Raise `ConfigError` for `rtc` with a policy that samples nothing to guide.
+
+    `section` has the key that the message names.
+    """
     if chunking == "rtc" and not stochastic:
         raise ConfigError(
-            "rollout.chunking: expected none or temporal, as this policy draws nothing that could "
-            "be guided, found rtc. Choose one of them, or train with train_head.model_type "
+            f"{section}.chunking: expected none or temporal, as this policy draws nothing that "
+            "could be guided, found rtc. Choose one of them, or train with train_head.model_type "
             "diffusion or flow_matching."
         )

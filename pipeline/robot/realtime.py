@@ -189,7 +189,9 @@ class _Run:
         self.chunk_shape = (meta["horizon"], meta["action_dim"])
         self.views = tuple(meta["streams"]["views"]) if meta["uses_features"] else ()
         moving = tuple(meta["moving"])
-        executor = Executor(settings.chunking, settings.execute, meta["horizon"], moving)
+        executor = Executor(
+            settings.chunking, settings.execute, meta["horizon"], moving, "drive.settings"
+        )
         reuse = max(1, round(meta["vlm_reuse_count"] * self.hz / meta["action_hz"]))
         self.loop = ControlLoop(executor, reuse, meta["uses_features"])
         self.policy = PolicyThread(policy.infer, settings.fifo_priority - 1)

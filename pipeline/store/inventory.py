@@ -131,7 +131,7 @@ def fate_of(entry: StoreEntry) -> tuple[Fate, str]:
     if held in stores and not entry.base.exists():
         return "kept", f"the only copy of {entry.base.name}, which a killed replacement left there"
     if kind == "previous":
-        return "by name", "the store before, kept until the next successful run"
+        return "by name", "the store before, kept until the next run that changes the store"
     if done:
         return "by name", f"unfinished build with {done} feature rows; the same command goes on"
     if any(path.glob(f"{KNOWN}/*/{ASIDE_METADATA}")):

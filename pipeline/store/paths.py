@@ -2,7 +2,7 @@
 
     <name>.zarr            the finished store, never modified
     <name>.zarr.part       the build; `.known/<n>` in it are interrupted builds of other plans
-    <name>.zarr.previous   the replaced store, kept and marked, where it has more episodes
+    <name>.zarr.previous   the replaced store, kept and marked, where it has other rows
 
 A process that changes one of them must hold `<name>.zarr.lock` and call `recover` first. A part
 goes through these states. Known rows come from the store, the previous one, a part with a plan and

@@ -17,6 +17,7 @@ from pipeline.base.border import Border, Document
 from pipeline.base.commands import command
 from pipeline.base.config import VLMParams
 from pipeline.base.errors import VLMError
+from pipeline.base.hub import could_be_hub_id
 from pipeline.base.source import TunedOn, join_tuned_on, read_tuned_on
 
 VLMS = Border(
@@ -74,12 +75,6 @@ def folder_here(checkpoint: str) -> Path | None:
         return folder if folder.is_dir() else None
     except (OSError, RuntimeError, ValueError):  # too long, unknown user, or cannot be encoded
         return None
-
-
-def could_be_hub_id(checkpoint: str) -> bool:
-    """Whether a text has the form of a hub id: an owner and a name."""
-    parts = checkpoint.split("/")
-    return len(parts) == 2 and all(parts) and parts[0][0] not in ".~"
 
 
 def cached_checkpoint(checkpoint: str, revision: str | None) -> Path | None:

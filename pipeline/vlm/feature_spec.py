@@ -17,10 +17,10 @@ from pipeline.base.commands import command
 from pipeline.base.config import VLMParams
 from pipeline.base.differences import describe, differences
 from pipeline.base.errors import VLMError
+from pipeline.base.hub import could_be_hub_id
 from pipeline.base.source import Frames, row_key
 from pipeline.vlm.checkpoint_folder import (
     adapter_files,
-    could_be_hub_id,
     folder_here,
     read_config,
     resolve_checkpoint,

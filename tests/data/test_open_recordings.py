@@ -119,7 +119,7 @@ def test_a_root_that_is_not_there_is_named_itself(tmp_path):
         open_recordings([Source(name="raw", path="raw")], tmp_path / "nowhere")
 
 
-HUB = "hf download --repo-type dataset"
+HUB = "hub: owner/name in place of path"
 
 
 @pytest.mark.parametrize(

@@ -436,6 +436,46 @@ class TestWhatWouldBeLost:
         assert contents(store) == whole
 
     @pytest.mark.usefixtures("extracted")
+    def test_an_instruction_changed_and_changed_back_computes_nothing(
+        self, params, changed, recordings, counted, write_episode
+    ):
+        store, previous = params.extract.store, params.extract.store.with_name("made.zarr.previous")
+        whole, source = contents(store), params.data.sources[0].model_dump()
+        other = {"sources": [source | {"instruction": "hold still"}]}
+        _, said = run(changed(data=other, extract={"plan": True}))
+        (line,) = (line for line in said if str(previous) in line)
+        assert "is kept as" in line
+        assert "on the disk" in line
+        assert sum(counted) == 0
+        report, said = run(changed(data=other))
+        assert sum(counted) == report.computed > 0
+        (line,) = (line for line in said if line.startswith(f"{previous}: "))
+        assert "MiB" in line
+        assert "store gc" in line
+        second = contents(store)
+        assert run(changed(data=other))[0] is None
+        assert contents(previous).items() >= whole.items(), "a run that changes nothing keeps it"
+        for data, then in (({}, whole), (other, second)):
+            counted.clear()
+            report, _ = run(changed(data=data))
+            assert not counted
+            assert report.taken == report.rows
+            assert contents(store) == then
+        write_episode(recordings / "Press" / "episode_9", 9)
+        run(changed(data=other))
+        assert not previous.exists(), "the store of before had no row that this one lacks"
+
+    @pytest.mark.usefixtures("extracted")
+    def test_a_damaged_store_is_not_kept_for_its_rows(self, params, changed):
+        store = params.extract.store
+        path = store / "vl" / "key" / "c" / "0" / "0"
+        damaged = bytearray(path.read_bytes())
+        damaged[0] ^= 1
+        path.write_bytes(damaged)
+        run(changed(vlm={"prompt": "{images} do: {instruction}"}))
+        assert not store.with_name("made.zarr.previous").exists()
+
+    @pytest.mark.usefixtures("extracted")
     def test_an_interrupted_return_still_takes_the_rows_of_the_kept_store(
         self, params, unmount, monkeypatch, counted
     ):

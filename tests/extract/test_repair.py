@@ -202,6 +202,16 @@ def test_nothing_is_taken_over_by_damaged_keys(case, tmp_path):
     assert contents(case.store) == contents(fresh.extract.store)
 
 
+def test_a_store_under_repair_is_not_kept_for_its_rows(case):
+    flipped_feature(case)
+    repair(case.verified(), case.params, quiet)
+    (source,) = case.document["data"]["sources"]
+    other = {"sources": [source | {"instruction": "hold still"}]}
+    case.document["data"] = case.document["data"] | other
+    extract(case.params, quiet)
+    assert not case.store.with_name("copy.zarr.previous").exists()
+
+
 def test_what_was_extracted_holds_together(case, hold_together):
     hold_together(FeatureStore.open(case.store))
 

@@ -1,5 +1,6 @@
 """A robot that params name is driven, stopped by its limits, and recorded each time."""
 
+import signal
 import sys
 import textwrap
 from collections.abc import Callable
@@ -182,6 +183,20 @@ def test_an_arm_that_cannot_be_disconnected_does_not_hide_why_it_stopped(
     assert any("was not disconnected (no answer on the bus)" in line for line in said)
 
 
+def test_a_second_ctrl_c_does_not_cut_the_disconnection(
+    lerobot: Any, driven: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    left: list[str] = []
+
+    def disconnect(self: Any) -> None:
+        signal.raise_signal(signal.SIGINT)
+        left.append("torque off")
+
+    monkeypatch.setattr(import_module("lerobot.robots.fake_arm").Arm, "disconnect", disconnect)
+    _, said = driven()
+    assert left == ["torque off"] and not any("not disconnected" in line for line in said)
+
+
 def test_without_limits_it_warns(lerobot: Any, driven: Callable[..., Any]) -> None:
     assert any("drive.limits" in line for line in driven()[1])
 
@@ -196,6 +211,8 @@ def test_what_cannot_be_driven_is_refused_by_its_key(
         "drive.robot_args": {"robot": "fractions:Fraction", "robot_args": {"sed": 1}},
         "drive.settings.old_features_s": {"settings": {"old_features_s": "soon"}},
         "drive.settings: expected instruction": {"settings": {"old_features": 1}},
+        "drive.settings.execute: expected 1 to": {"settings": {"execute": 99}},
+        "drive.settings.chunking: .*found rtc": {"settings": {"chunking": "rtc"}},
     }
     for place, changed in wrong.items():
         with pytest.raises(ConfigError, match=place):

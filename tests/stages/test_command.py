@@ -42,14 +42,18 @@ def test_two_and_one_message_for_what_the_user_can_mend(capfd, tmp_path):
 
 
 def test_two_for_bad_params_and_a_misspelt_key_is_recognised(capsys):
-    wrong = ["nothing.like=it", "train_head.expert.layer=2", "data.sources=[{name: a, paths: x}]"]
+    wrong = [
+        "nothing.like=it",
+        "train_head.expert.layer=2",
+        "data.sources=[{name: a, paths: x}, {name: b}]",
+    ]
     options = [word for override in wrong for word in ("--set", override)]
     assert run("Summary.", print, ["--params", PARAMS, *options]) == 2
     err = capsys.readouterr().err
     assert "nothing: unknown key; expected one of: demo, data, vlm" in err
     assert "train_head.expert.layer: unknown key; did you mean layers?" in err
     assert "data.sources.0.paths: unknown key; did you mean path?" in err
-    assert "data.sources.0.path: missing" in err
+    assert "data.sources.1: expected either path or hub, found neither" in err
 
 
 def test_an_argument_that_is_none_is_named(capsys):
@@ -84,12 +88,21 @@ def test_short_options_set_keys_and_are_repeated_in_what_a_message_advises():
     def work(params):
         seen.append((params.train_head.lr, params.data.views, advised("evaluate")))
 
-    options = (*short("train_head", "--lr"), *short("data", "--views"))
-    arguments = ["--params", PARAMS, "--lr", "1e-3", "--views", "View1", "View2"]
+    options = (*short("train_head", "--lr", "--steps"), *short("data", "--views"))
+    arguments = ["--params", PARAMS, "--lr", "1e-3", "--steps", "8", "--views", "View1", "View2"]
     assert run("Summary.", work, arguments, options) == 0
     ((lr, views, printed),) = seen
     assert (lr, views) == (1e-3, ("View1", "View2"))
-    assert "--set train_head.lr=1e-3" in printed and "data.views" in printed
+    assert "--set train_head.lr=1e-3" in printed and "train_head.max_steps=8" in printed
+    assert "data.views" in printed
+
+
+@pytest.mark.parametrize("folder", ["2026", "1e3", "null", "yes", "2026-11-26", "a b", "plain"])
+def test_a_folder_stays_text_whatever_yaml_would_read(folder):
+    seen = []
+    options = short("train_head", "--out")
+    assert run("Summary.", seen.append, ["--params", PARAMS, "--out", folder], options) == 0
+    assert seen[0].train_head.output == Path(folder)
 
 
 def test_keys_are_listed_with_defaults_and_meaning(capsys):

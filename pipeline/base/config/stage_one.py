@@ -4,9 +4,10 @@ import re
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BeforeValidator, Field, field_validator
+from pydantic import BeforeValidator, Field, field_validator, model_validator
 
 from pipeline.base.config.section import Globs, Output, PathOrName, Place, Section, Seed
+from pipeline.base.hub import could_be_hub_id
 
 RecordingFormat = Literal["auto", "raw", "new", "old", "lerobot"]
 Pooling = Literal["mean", "image_mean", "text_mean", "view_mean", "grid", "last"]
@@ -58,8 +59,11 @@ class Source(Section):
 
     name: str = Field(min_length=1, max_length=200)
     """The source's name in `train_head.mixture` and in reports."""
-    path: Globs
+    path: Globs | None = None
     """Globs or paths of episodes, folders of episodes, or LeRobot roots; relative to data.root."""
+    hub: str | None = None
+    """In place of `path`: a data set on the Hugging Face Hub, as owner/name or
+    owner/name@revision."""
     format: RecordingFormat = "auto"
     """Format of the recordings; `auto` decides by the files in a folder."""
     instruction: str | None = None
@@ -70,8 +74,21 @@ class Source(Section):
 
     @property
     def paths(self) -> tuple[str, ...]:
-        """The globs as a tuple."""
-        return (self.path,) if isinstance(self.path, str) else self.path
+        """The globs as a tuple; none for a source on the Hub."""
+        return (self.path,) if isinstance(self.path, str) else self.path or ()
+
+    @model_validator(mode="after")
+    def _is_somewhere(self) -> "Source":
+        if (self.path is None) == (self.hub is None):
+            both = "neither" if self.path is None else "both"
+            raise ValueError(f"expected either path or hub, found {both}")
+        if self.hub is not None:
+            repo, at, revision = self.hub.partition("@")
+            if not could_be_hub_id(repo) or bool(at) != bool(revision):
+                raise ValueError(
+                    f"hub: expected owner/name or owner/name@revision, found {self.hub!r}"
+                )
+        return self
 
 
 class DataParams(Section):

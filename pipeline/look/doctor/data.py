@@ -8,7 +8,7 @@ import numpy as np
 
 from pipeline.base.commands import command
 from pipeline.base.config import MediaLimits, Params, Source
-from pipeline.base.errors import Issue, RecordingError
+from pipeline.base.errors import ConfigError, Issue, RecordingError
 from pipeline.data import Opened, Recording, open_recordings
 from pipeline.data.recording import DEFAULT_LIMITS
 from pipeline.data.video import opened_video
@@ -33,7 +33,7 @@ def check_recordings(params: Params) -> Iterator[Issue]:
     for source in data.sources:
         try:
             opened = open_recordings([source], data.root, data.views)
-        except RecordingError as error:
+        except (ConfigError, RecordingError) as error:
             yield missing(source.name, str(error), demo or "mend data.sources")
         else:
             yield from check_source(source, opened, data.on_bad_episode)

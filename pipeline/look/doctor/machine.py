@@ -12,6 +12,7 @@ import torch
 from pipeline.base.commands import command
 from pipeline.base.config import Params, VLMParams
 from pipeline.base.errors import ConfigError, Issue, VLMError
+from pipeline.base.hub import could_be_hub_id
 from pipeline.base.machine import available_bytes, memory_bytes, resolve_device
 from pipeline.base.text import size
 from pipeline.look.doctor import missing, note, ok
@@ -144,7 +145,7 @@ def local_folder(checkpoint: str, revision: str | None) -> Path | None:
     """The folder of a checkpoint on this machine, or in its cache of the hub; None without."""
     if folder := checkpoint_folder.folder_here(checkpoint):
         return folder
-    if not checkpoint_folder.could_be_hub_id(checkpoint):
+    if not could_be_hub_id(checkpoint):
         return None
     return checkpoint_folder.cached_checkpoint(checkpoint, revision)
 
@@ -155,7 +156,7 @@ def absent_checkpoint(params: Params) -> Issue:
     absent, remedy = f"{checkpoint}: not on this machine", f"hf download {checkpoint}"
     if Path(checkpoint) == params.demo.checkpoint:
         return missing(subject, absent, f"{command('demo')} (or dvc repro)")
-    if not checkpoint_folder.could_be_hub_id(checkpoint):
+    if not could_be_hub_id(checkpoint):
         return missing(subject, f"{absent}, and no hub id", _EXAMPLE)
     return note(subject, f"{absent}; the first extraction downloads it", remedy)
 
