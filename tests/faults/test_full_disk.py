@@ -78,7 +78,7 @@ def test_train_and_evaluate(
     output, report = small_disk / "head", small_disk / "report"
     params = head_params(
         store,
-        train_head={"output": str(output)},
+        train_head={"output": str(output), "max_steps": 8},
         evaluate={"checkpoint": str(output), "output": str(report)},
     )
     full_then_free(20_000, "stages.train_head", params)
