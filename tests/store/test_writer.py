@@ -234,6 +234,7 @@ class TestSeal:
                 target.symlink_to("big")
             killed = killed_before(kill_at, lambda: put_in_place(target, keep=True))
             recover(target)
+            assert not KEPT.marks(target)
             if part_path(target).exists():
                 put_in_place(target, keep=True)
             for store, seed in ((target, 0), (previous, 1)):
