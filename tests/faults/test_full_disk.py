@@ -63,7 +63,7 @@ def full_then_free(fork, here, small_disk: Path) -> Callable[..., None]:
     return check
 
 
-@pytest.mark.parametrize("leave", [50_000, 1_500_000])
+@pytest.mark.parametrize("leave", [pytest.param(50_000, marks=pytest.mark.slow), 1_500_000])
 def test_extract(document, small_disk: Path, full_then_free, params: Path, leave: int) -> None:
     target = small_disk / "made.zarr"
     options = ["--set", f"extract.store={target}", "--set", "extract.sensor_dtype=float16"]
