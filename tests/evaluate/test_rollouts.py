@@ -255,6 +255,7 @@ def test_a_stream_that_is_off_says_nothing(monkeypatch: pytest.MonkeyPatch) -> N
         assert len(silent) > 5
         assert all(seen[other].any() and not (seen[other] == 0.25).all() for seen in silent)
         assert len({tuple(seen["feature_age"]) for seen in silent}) > 3
+        assert all(seen["slot_valid"].all() and seen["feature_age"].max() < 0.4 for seen in silent)
 
 
 @pytest.mark.parametrize("stream", ["features", "state"])
