@@ -21,7 +21,7 @@ TINY = {
     "data": {"vlm_reuse_count": 9},
     "vlm": {"image_resize_height": 56, "image_resize_width": 56, "pooling": ["mean"]},
     "train_head": {"max_steps": 6, "eval_every": 3, "checkpoint_every": 3, "warmup_steps": 1},
-    "rollout": {"episodes": 1},
+    "rollout": {"episodes": 1, "ablations": []},
 }
 NOTES = ("params.yaml", "dvc.lock")
 

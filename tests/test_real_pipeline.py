@@ -16,7 +16,7 @@ from pipeline.base.config import load_params
 from pipeline.store import FeatureStore
 
 ROOT = Path(__file__).resolve().parents[1]
-REUSE = 9
+REUSE = 20
 Run = Callable[..., str]
 
 

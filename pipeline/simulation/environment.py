@@ -138,21 +138,22 @@ class InsertionEnvironment(gymnasium.Env[Any, NDArray[np.floating[Any]]]):
         """The newest frame (126, 224, 3) of each camera, as a recording has it."""
         return {
             view: (time, through_jpeg(photograph(view, self.insertion, time)))
-            for view, time in self._frame_times().items()
+            for view, time in self.frame_times().items()
         }
 
     def render(self) -> NDArray[np.uint8]:  # pyright: ignore[reportIncompatibleMethodOverride]
         """The newest frames side by side."""
         return np.concatenate([frame for _, frame in self.frames().values()], axis=1)
 
-    def _frame_times(self) -> Mapping[str, float]:
+    def frame_times(self) -> Mapping[str, float]:
+        """When the newest frame of each camera was taken, in s."""
         now = self.insertion.time_s + 1e-9
         newest = [shots[shots <= now].max() for shots in self._shots]
         return dict(zip(VIEWS, map(float, newest), strict=True))
 
     def _info(self) -> dict[str, Any]:
         outcome = self.insertion.outcome
-        info = {"success": outcome == INSERTED, "frame_time": self._frame_times()}
+        info = {"success": outcome == INSERTED, "frame_time": self.frame_times()}
         return info | ({"reason": outcome} if outcome else {})
 
 

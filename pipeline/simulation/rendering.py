@@ -68,8 +68,12 @@ def photograph(view: str, insertion: NeedleInsertion, time_s: float) -> NDArray[
     image = render(view, insertion.scene(time_s))
     # A recording's clock in whole milliseconds may begin a little before the episode.
     seed = [insertion.layout.seed, 104, VIEWS.index(view), max(0, round(time_s * 1e4))]
-    noise = np.random.default_rng(seed).standard_normal(image.shape, np.float32)
-    return np.clip(np.rint(image + _NOISE * noise), 0, 255).astype(np.uint8)
+    level = np.random.default_rng(seed).standard_normal(image.shape, np.float32)
+    # In place: every copy of a frame costs as much as this arithmetic.
+    level *= _NOISE
+    level += image
+    np.clip(np.rint(level, out=level), 0, 255, out=level)
+    return level.astype(np.uint8)
 
 
 def through_jpeg(image: NDArray[np.uint8]) -> NDArray[np.uint8]:

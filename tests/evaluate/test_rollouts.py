@@ -246,12 +246,16 @@ def test_a_stream_that_is_off_says_nothing(monkeypatch: pytest.MonkeyPatch) -> N
     }
     checkpoint = replace(checkpoint, normalization=replace(normal, **spread))
     given = watch(monkeypatch, policy)
-    rolled((checkpoint, policy, glance), episodes=1)
+    rollouts = rolled((checkpoint, policy, glance), episodes=1)
+    # The model makes no pass for features that nobody sees.
+    ticks = [rollouts.of(controller)[0].ticks for controller in ("policy", "sensor off")]
+    assert len(glance.passes) == sum(-(-(count - 1) // 3) for count in ticks)
     for stream, other in (("sensor", "features"), ("features", "sensor")):
         silent = [seen for seen in given if (seen[stream] == 0.25).all()]
         assert len(silent) > 5
-        assert not any((seen[other] == 0.25).all() for seen in silent)
+        assert all(seen[other].any() and not (seen[other] == 0.25).all() for seen in silent)
         assert len({tuple(seen["feature_age"]) for seen in silent}) > 3
+        assert all(seen["slot_valid"].all() and seen["feature_age"].max() < 0.4 for seen in silent)
 
 
 @pytest.mark.parametrize("stream", ["features", "state"])

@@ -63,7 +63,7 @@ def full_then_free(fork, here, small_disk: Path) -> Callable[..., None]:
     return check
 
 
-@pytest.mark.parametrize("leave", [50_000, 1_500_000])
+@pytest.mark.parametrize("leave", [pytest.param(50_000, marks=pytest.mark.slow), 1_500_000])
 def test_extract(document, small_disk: Path, full_then_free, params: Path, leave: int) -> None:
     target = small_disk / "made.zarr"
     options = ["--set", f"extract.store={target}", "--set", "extract.sensor_dtype=float16"]
@@ -78,7 +78,7 @@ def test_train_and_evaluate(
     output, report = small_disk / "head", small_disk / "report"
     params = head_params(
         store,
-        train_head={"output": str(output)},
+        train_head={"output": str(output), "max_steps": 8},
         evaluate={"checkpoint": str(output), "output": str(report)},
     )
     full_then_free(20_000, "stages.train_head", params)

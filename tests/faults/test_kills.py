@@ -65,7 +65,7 @@ def kill_after(fork) -> Callable[..., None]:
 
 
 @pytest.mark.parametrize(
-    ("kills", "seed"), [(3, 0), *(pytest.param(8, n, marks=pytest.mark.slow) for n in range(1, 4))]
+    ("kills", "seed"), [(2, 0), *(pytest.param(8, n, marks=pytest.mark.slow) for n in range(1, 4))]
 )
 def test_a_training_killed_again_and_again(
     tiny_store: Callable[..., Path], head_params, kill_after, here, tmp_path: Path, kills, seed

@@ -29,7 +29,7 @@ def read_only(store: Path, tmp_path: Path) -> Iterator[Path]:
 def test_stage_two_and_every_check_work(read_only: Path, params: Path, here, tmp_path) -> None:
     options = ["--set", f"extract.store={read_only}"]
     for name, *more in (
-        ("stages.train_head",),
+        ("stages.train_head", "--set", "train_head.max_steps=4"),
         ("stages.evaluate",),
         ("stages.verify",),
         ("stages.archive", "--set", f"archive.output={tmp_path / 'copy.archive.zarr'}"),

@@ -195,7 +195,7 @@ def over_a_websocket(rng: np.random.Generator, address: str, fields: dict[str, A
 
 
 @pytest.mark.parametrize(
-    "messages", [100, pytest.param(10_000, marks=[pytest.mark.slow, pytest.mark.timeout(3000)])]
+    "messages", [50, pytest.param(10_000, marks=[pytest.mark.slow, pytest.mark.timeout(3000)])]
 )
 def test_broken_messages(messages: int, running, observe) -> None:
     short = {"sensor": np.zeros((2, 1026), np.float32), "sensor_time": np.array([0.01, 0.02])}

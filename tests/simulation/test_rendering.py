@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pipeline.simulation.insertion import Scene
+from pipeline.simulation.insertion import NeedleInsertion, Scene
 from pipeline.simulation.layout import WORKSPACE_MM
-from pipeline.simulation.rendering import HEIGHT, VIEWS, WIDTH, render
+from pipeline.simulation.rendering import HEIGHT, VIEWS, WIDTH, photograph, render
 
 SCENE = Scene(np.array([-5.0, -3.0]), np.array([0.4, 0.3]), np.array([5.0, 2.0]), 1.0)
 
@@ -82,3 +82,13 @@ def test_the_side_view_does_not_show_depth_into_the_image() -> None:
 def test_brightness_scales_all_colours() -> None:
     dark, light = (render("View5", replace(SCENE, brightness=b)).astype(int) for b in (0.8, 1.0))
     assert np.abs(dark - 0.8 * light).max() <= 1
+
+
+def test_a_frame_is_the_image_with_noise_that_favours_no_side() -> None:
+    insertion = NeedleInsertion()
+    insertion.reset(5, "full")
+    frame = photograph("View2", insertion, 0.0)
+    noise = frame.astype(float) - render("View2", insertion.scene(0.0))
+    assert noise.mean() == pytest.approx(0, abs=0.05)
+    assert noise.std() == pytest.approx(2, abs=0.1)
+    assert (photograph("View2", insertion, 0.0) == frame).all()

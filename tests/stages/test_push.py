@@ -84,8 +84,10 @@ def hub() -> Iterator[Hub]:
 
 
 def test_a_judged_policy_is_uploaded_with_its_own_figures(
-    trained: Path, hub: Hub, tmp_path: Path
+    trained: Path, hub: Hub, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    # Pages, whose pictures take most of the time, are not uploaded.
+    monkeypatch.setattr("pipeline.look.page.writing.write_report", lambda *_: [])
     set_ = [f"evaluate.output={tmp_path / 'evaluate'}", "evaluate.modalities=false"]
     set_ += [
         f"rollout.output={tmp_path / 'rollout'}",

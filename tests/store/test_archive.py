@@ -4,12 +4,11 @@ import json
 import os
 import random
 import shutil
-import signal
 import subprocess
-import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import dask.array
 import google_crc32c
@@ -17,8 +16,9 @@ import numpy as np
 import pytest
 import zarr
 
+import pipeline.store.archive as archives
 from pipeline.base.errors import ConfigError, DiskFull, StoreIncomplete, StoreLocked, StoreMismatch
-from pipeline.store import FeatureStore, Sizes, StoreBuild, arrays, build_lock, part_path
+from pipeline.store import FeatureStore, Sizes, StoreBuild, arrays, build_lock, part_path, schema
 from pipeline.store.archive import archive, codec_for, is_archive, restore
 from pipeline.store.schema import INCREMENTAL, read_specs
 from tests.store.samples import TEXT, attributes_of, content, edit, flip, index_of, put
@@ -367,44 +367,44 @@ def test_a_full_disk_keeps_nothing_of_what_was_begun(originals, small_disk):
     assert sorted(os.listdir(folder)) == ["a.zarr.lock", "back.zarr.lock"]
 
 
-SLOWED = """
-import sys, time
-from pathlib import Path
-import pipeline.store.archive as module
-from pipeline.store import schema
-schema.CHUNK_BYTES, module.SHARD_BYTES, module.INNER_BYTES = 2**17, 2**18, 2**14
-def slow(*arguments, real=module._read_shard):
-    time.sleep(0.02)
-    return real(*arguments)
-module._read_shard = slow
-what, source, target = sys.argv[1], Path(sys.argv[2]), Path(sys.argv[3])
-if what == "archive":
-    module.archive(source, target, 1, 2)
-else:
-    module.restore(source, target, 2)
-"""
-"""Archives or restores, slowly enough to be killed midway."""
+def work_slowly(what: str, source: Path, target: Path) -> None:
+    """Archive or restore, slowly enough to be killed midway."""
+    real = archives._read_shard
+
+    def slow(*arguments: Any) -> Any:
+        time.sleep(0.02)
+        return real(*arguments)
+
+    schema.CHUNK_BYTES, archives.SHARD_BYTES, archives.INNER_BYTES = 2**17, 2**18, 2**14
+    archives._read_shard = slow
+    if what == "archive":
+        archive(source, target, 1, 2)
+    else:
+        restore(source, target, 2)
 
 
 @pytest.mark.parametrize("what", ["archive", "restore"])
 @pytest.mark.parametrize(
     ("kills", "seed"), [(1, 0), *(pytest.param(6, n, marks=pytest.mark.slow) for n in range(1, 4))]
 )
-def test_kills_at_random_instants_end_in_the_whole(originals, tmp_path, what, kills, seed):
+def test_kills_at_random_instants_end_in_the_whole(
+    originals, fork_server, tmp_path, what, kills, seed
+):
     chance = random.Random(seed)
     store, output = originals / "s.zarr", originals / "s.archive.zarr"
     source = store if what == "archive" else output
     target = tmp_path / "target.zarr"
     hits = 0
     for _ in range(kills):
-        process = subprocess.Popen([sys.executable, "-c", SLOWED, what, str(source), str(target)])
-        while process.poll() is None and not part_path(target).exists():
+        process = fork_server.Process(target=work_slowly, args=(what, source, target))
+        process.start()
+        while process.is_alive() and not part_path(target).exists():
             time.sleep(0.002)
         time.sleep(chance.uniform(0.0, 0.4))
-        hits += process.poll() is None
+        hits += process.is_alive()
         assert not target.exists()
-        process.send_signal(signal.SIGKILL)
-        process.wait()
+        process.kill()
+        process.join()
         assert not is_archive(part_path(target)), "only a complete archive has a manifest"
     assert hits == kills, "the kills came too late to test anything"
     if what == "archive":

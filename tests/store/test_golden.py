@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import zarr
 
-from pipeline.base.errors import StoreIncomplete
+from pipeline.base.errors import StoreIncomplete, StoreMismatch
 from pipeline.base.source import MOST_GOLDEN, row_key, spread
 from pipeline.store import FeatureStore, StoreBuild
 from pipeline.store.archive import archive, restore
@@ -124,6 +124,9 @@ class TestOtherStores:
         restore(tmp_path / "a.archive.zarr", tmp_path / "back.zarr", 1)
         assert content(tmp_path / "back.zarr") == content(store)
         assert archive(store, tmp_path / "a.archive.zarr", 1, 1) is None, "it is there already"
+        flip(store / "golden/0/View1/c/0/0/0", 3)
+        with pytest.raises(StoreMismatch, match="not an archive of"):
+            archive(store, tmp_path / "a.archive.zarr", 1, 1)
 
     def test_a_damaged_golden_row_of_an_archive_is_named(self, store, tmp_path):
         archive(store, tmp_path / "a.archive.zarr", 1, 1)

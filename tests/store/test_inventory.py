@@ -2,10 +2,11 @@
 
 import os
 import shutil
-import subprocess
-import sys
+import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from dataclasses import replace
+from multiprocessing.connection import Connection
+from multiprocessing.context import ForkServerContext
 from pathlib import Path
 
 import pytest
@@ -37,27 +38,26 @@ from pipeline.store.schema import read_specs
 from pipeline.store.verification import strange_files
 
 Make = Callable[..., Path]
-HOLD = """
-import sys
-from pathlib import Path
-from pipeline.store import build_lock
-with build_lock(Path(sys.argv[1])):
-    print("held", flush=True)
-    sys.stdin.read()
-"""
 
 
-@contextmanager
-def held(target: Path) -> Iterator[int]:
-    """Another process holds the lock of a store; gives its number."""
-    code = [sys.executable, "-c", HOLD, str(target)]
-    with subprocess.Popen(code, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
-        assert process.stdout is not None
-        assert process.stdout.readline() == b"held\n"
-        try:
-            yield process.pid
-        finally:
-            process.kill()
+def hold_lock(target: Path, told: Connection) -> None:
+    """Hold the lock of a store, and tell so."""
+    with build_lock(target):
+        told.send("held")
+        time.sleep(600)
+
+
+@pytest.fixture
+def held(fork_server: ForkServerContext, tmp_path: Path) -> Iterator[int]:
+    """Another process, of this number, holds the lock of the tiny store."""
+    heard, told = fork_server.Pipe(duplex=False)
+    process = fork_server.Process(target=hold_lock, args=(tmp_path / "tiny.zarr", told))
+    process.start()
+    assert heard.recv() == "held"
+    assert process.pid is not None
+    yield process.pid
+    process.kill()
+    process.join()
 
 
 def entry(folder: Path, name: str) -> StoreEntry:
@@ -224,16 +224,17 @@ class TestLeftovers:
         remove_entry(listed, fate)  # listed while the store was still there
         assert part.exists()
 
-    def test_what_is_being_built_is_not_touched(self, tiny_store: Make, tmp_path: Path) -> None:
+    def test_what_is_being_built_is_not_touched(
+        self, tiny_store: Make, tmp_path: Path, held: int
+    ) -> None:
         part = unfinish(tiny_store(tmp_path), 5)
-        (listed,) = find_named(list_stores(tmp_path), [part])
-        with held(tmp_path / "tiny.zarr") as process:
-            entries = list_stores(tmp_path)
-            with pytest.raises(ConfigError, match="in use by process"):
-                find_named(entries, [part])
-            assert describe_kept(entries)[0].startswith(f"{part}: in use by process {process}")
-            with pytest.raises(StoreLocked, match="not removed"):
-                remove_entry(listed, fate_of(listed)[0])
+        entries = list_stores(tmp_path)
+        with pytest.raises(ConfigError, match="in use by process"):
+            find_named(entries, [part])
+        assert describe_kept(entries)[0].startswith(f"{part}: in use by process {held}")
+        listed = replace(entry(tmp_path, part.name), holder=None)  # listed before that build began
+        with pytest.raises(StoreLocked, match="not removed"):
+            remove_entry(listed, fate_of(listed)[0])
         assert part.exists()
 
     @pytest.mark.parametrize("state", ["begun", "damaged", "sealed", "kept"])

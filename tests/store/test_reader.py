@@ -109,7 +109,7 @@ class TestGather:
         window = data.draw(st.integers(1, 40))
         horizon = data.draw(st.integers(1, 12))
         lag = data.draw(st.integers(0, 12))
-        lag_s = data.draw(st.sampled_from([0.0, 0.013, 0.21, 5.0]))
+        lag_s = data.draw(st.sampled_from([0.0, 0.013, 0.2, 0.5, 5.0]))
         window_s = data.draw(st.sampled_from([None, 1e-9, 0.05, 0.3, 9.0]))
         batch = store.gather(
             ticks,

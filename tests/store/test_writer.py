@@ -61,6 +61,33 @@ def begun(folder: Path, plan: str = "plan") -> StoreBuild:
     return build
 
 
+@pytest.fixture(scope="module")
+def laid_out(tmp_path_factory) -> Path:
+    """A folder with a laid-out build, to be copied."""
+    folder = tmp_path_factory.mktemp("laid_out")
+    begun(folder).close()
+    return folder
+
+
+@pytest.fixture(scope="module")
+def full(tmp_path_factory) -> Callable[..., StoreBuild]:
+    """`full(folder, plan, seed)`: a build with all its rows, a copy of one that is made once."""
+    originals: dict[tuple[str, int], StoreBuild] = {}
+
+    def copied(folder: Path, plan: str = "plan", seed: int = 0) -> StoreBuild:
+        if (plan, seed) not in originals:
+            build = begun(tmp_path_factory.mktemp("full"), plan)
+            number = build.environment_index({"torch": plan})
+            keys = [bytes([row] * 16) for row in range(ROWS)]
+            build.commit(range(ROWS), rows_of(seed, ROWS), keys, number)
+            build.close()
+            originals[plan, seed] = build
+        shutil.copytree(originals[plan, seed].part, folder / "s.zarr.part")
+        return StoreBuild(folder / "s.zarr", SPECS, plan)
+
+    return copied
+
+
 def resumed(build: StoreBuild) -> StoreBuild:
     build.close()
     return StoreBuild(build.target, build.specs, build.plan)
@@ -92,10 +119,11 @@ class TestCommit:
         kept=st.floats(0, 1),
     )
     def test_a_kill_at_any_write_leaves_only_whole_rows(
-        self, tmp_path_factory, batches, kill_at, kept
+        self, laid_out, tmp_path_factory, batches, kill_at, kept
     ):
         """Against a dict: what is not missing after the kill is what was handed over last."""
-        build = begun(tmp_path_factory.mktemp("kill"))
+        folder = Path(shutil.copytree(laid_out, tmp_path_factory.mktemp("kill") / "stores"))
+        build = StoreBuild(folder / "s.zarr", SPECS, "plan")
         number = build.environment_index({"torch": "1"})
         expected: dict[int, tuple[np.ndarray, bytes]] = {}
         offered: dict[int, list[tuple[np.ndarray, bytes]]] = {}
@@ -145,16 +173,8 @@ class TestCommit:
 
 
 class TestSeal:
-    def full(self, folder: Path, plan: str = "plan", seed: int = 0) -> StoreBuild:
-        build = begun(folder, plan)
-        number = build.environment_index({"torch": plan})
-        build.commit(
-            range(ROWS), rows_of(seed, ROWS), [bytes([i] * 16) for i in range(ROWS)], number
-        )
-        return build
-
-    def test_zarr_refuses_features_until_sealed(self, tmp_path):
-        build = self.full(tmp_path)
+    def test_zarr_refuses_features_until_sealed(self, full, tmp_path):
+        build = full(tmp_path)
         with pytest.raises(ValueError, match="checksum"):
             zarr.open_array(build.part, path=FEATURES, mode="r")[:]
         build.seal()
@@ -176,12 +196,14 @@ class TestSeal:
             (True, ((Path, "rename"), (Path, "unlink"), (shutil, "rmtree")), 1),
         ],
     )
-    def test_a_kill_at_any_step_is_mended_by_sealing_again(self, tmp_path, replaces, steps, stride):
+    def test_a_kill_at_any_step_is_mended_by_sealing_again(
+        self, full, tmp_path, replaces, steps, stride
+    ):
         """Kill before the n-th of these steps, for every n (or every 13th), until none is left."""
         begun = tmp_path / "begun"
         if replaces:
-            self.full(begun, "before", seed=1).seal()
-        self.full(begun, "after").close()
+            full(begun, "before", seed=1).seal()
+        full(begun, "after").close()
 
         def check(folder: Path, kill_at: int) -> bool:
             build = StoreBuild(folder / "s.zarr", SPECS, "after")
@@ -199,11 +221,11 @@ class TestSeal:
         assert kill_everywhere(begun, check, stride) >= 4
 
     @pytest.mark.parametrize("linked", [False, True])
-    def test_a_kill_while_the_old_is_kept_is_mended_by_sealing_again(self, tmp_path, linked):
+    def test_a_kill_while_the_old_is_kept_is_mended_by_sealing_again(self, full, tmp_path, linked):
         """Kill before the n-th change of the folders, for every n, until none is left."""
         built = tmp_path / "built"
-        self.full(built, "before", seed=1).seal()
-        self.full(built, "after").finish()
+        full(built, "before", seed=1).seal()
+        full(built, "after").finish()
 
         def check(folder: Path, kill_at: int) -> bool:
             target, previous = folder / "s.zarr", folder / "s.zarr.previous"
@@ -212,6 +234,7 @@ class TestSeal:
                 target.symlink_to("big")
             killed = killed_before(kill_at, lambda: put_in_place(target, keep=True))
             recover(target)
+            assert not KEPT.marks(target)
             if part_path(target).exists():
                 put_in_place(target, keep=True)
             for store, seed in ((target, 0), (previous, 1)):
@@ -225,9 +248,9 @@ class TestSeal:
         assert kill_everywhere(built, check) >= 3
 
     @pytest.mark.parametrize("link", [False, True])
-    def test_a_copy_or_link_of_the_user_is_not_the_kept_store(self, tmp_path, link):
-        self.full(tmp_path, "before", seed=1).seal()
-        self.full(tmp_path, "after").finish()
+    def test_a_copy_or_link_of_the_user_is_not_the_kept_store(self, full, tmp_path, link):
+        full(tmp_path, "before", seed=1).seal()
+        full(tmp_path, "after").finish()
         previous = previous_path(tmp_path / "s.zarr")
         if link:
             previous.symlink_to("s.zarr")
@@ -259,26 +282,26 @@ class TestSeal:
 
         assert kill_everywhere(tmp_path / "begun", check) > 6
 
-    def test_a_finished_store_replaced_is_never_written(self, tmp_path):
-        self.full(tmp_path, "before", seed=1).seal()
+    def test_a_finished_store_replaced_is_never_written(self, full, tmp_path):
+        full(tmp_path, "before", seed=1).seal()
         kept = tmp_path / "kept"
         subprocess.run(["cp", "-al", tmp_path / "s.zarr", kept], check=True)
         before = content(kept)
-        self.full(tmp_path, "after").seal()
+        full(tmp_path, "after").seal()
         assert content(kept) == before
 
-    def test_a_store_behind_a_symbolic_link_loses_the_link_alone(self, tmp_path):
-        self.full(tmp_path / "disk", "before", seed=1).seal()
+    def test_a_store_behind_a_symbolic_link_loses_the_link_alone(self, full, tmp_path):
+        full(tmp_path / "disk", "before", seed=1).seal()
         (tmp_path / "s.zarr").symlink_to(tmp_path / "disk" / "s.zarr")
-        self.full(tmp_path, "after").seal()
+        full(tmp_path, "after").seal()
         assert sorted(path.name for path in tmp_path.iterdir()) == ["disk", "s.zarr"]
         assert not (tmp_path / "s.zarr").is_symlink()
         behind = FeatureStore.open(tmp_path / "disk" / "s.zarr")
         assert np.array_equal(behind.array(FEATURES), rows_of(1, ROWS))
 
     @pytest.mark.parametrize("name", [FEATURES, "vl/key", "vl/checksum"])
-    def test_a_trailer_that_a_power_loss_left_out_costs_no_row(self, tmp_path, name):
-        build = self.full(tmp_path)
+    def test_a_trailer_that_a_power_loss_left_out_costs_no_row(self, full, tmp_path, name):
+        build = full(tmp_path)
         (path,) = build.files(name).paths
         data = build.specs[name].chunk_bytes
         os.truncate(path, data)
