@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 
 _NUMBERS = ("N", "RATE", "S")
 """Names of values that are numbers; the value of every other option stays text."""
+_YAML_WORDS = ("null", "true", "false", "yes", "no", "on", "off")
 STOPPED = "stopped; run the same command again"
 
 
@@ -60,9 +61,8 @@ class Shorthand:
         """Whether a value is laid over as typed: a number, or a word that YAML reads as itself."""
         if not isinstance(value, str) or not re.fullmatch(r"[\w.+-]+", value):
             return False
-        from yaml import safe_load
-
-        return self.value in _NUMBERS or safe_load(value) == value
+        text = value[0].isalpha() and value.lower() not in _YAML_WORDS
+        return text or self.value in _NUMBERS
 
 
 _SHORT = {
