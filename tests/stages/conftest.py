@@ -50,13 +50,13 @@ def quick_params(
     return document
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def trained(
     tmp_path_factory: pytest.TempPathFactory,
     demo_checkpoint: Path,
     tiny_head: Callable[..., dict[str, Any]],
 ) -> Path:
-    """A params.yaml whose head is trained on two recordings of the phantom; write nothing there."""
+    """A params.yaml whose head is trained on two recordings of the phantom."""
     folder = tmp_path_factory.mktemp("phantom")
     for seed in (5, 6):
         write_raw(folder / "raw" / "task", simulate_episode(seed, 1.7e9 + 100 * seed))
