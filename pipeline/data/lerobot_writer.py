@@ -1,9 +1,9 @@
 """Writes LeRobot data sets, and this project's sidecars beside them, for its own reader.
 
-`write_v21` writes many episodes, with one video per view; `write_v30` writes one episode, with the
-encoded images unchanged in its rows. `meta/info.json` is written last: until then the folder does
-not look like a recording. `units` and `kind` of a feature are this project's extension; other
-readers ignore them.
+`write_v21` and `write_filmed_v30` write many episodes, with one video per view and episode;
+`write_v30` writes one episode, with the encoded images unchanged in its rows. `meta/info.json` is
+written last: until then the folder does not look like a recording. `units` and `kind` of a feature
+are this project's extension; other readers ignore them.
 """
 
 import json
@@ -29,7 +29,12 @@ _DATA: Final = {
     "v2.1": "data/chunk-{episode_chunk:03d}/episode_{episode_index:06d}.parquet",
     "v3.0": "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet",
 }
-_VIDEO: Final = "videos/chunk-{episode_chunk:03d}/{video_key}/episode_{episode_index:06d}.mp4"
+_VIDEO: Final = {
+    "v2.1": "videos/chunk-{episode_chunk:03d}/{video_key}/episode_{episode_index:06d}.mp4",
+    "v3.0": "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4",
+}
+_CHUNK: Final = 1000
+"""Files in a folder."""
 _NUMBERING: Final = ("timestamp", "frame_index", "episode_index", "index", "task_index")
 _STATISTICS_EVERY: Final = 10
 """Image statistics use every tenth frame."""
@@ -68,7 +73,7 @@ def write_v21(
         data.parent.mkdir(parents=True, exist_ok=True)
         pq.write_table(_number_table(columns), data)
         for key, film in frames.items():
-            _write_video(root / _VIDEO.format(video_key=key, **place), film, fps)
+            _write_video(root / _VIDEO["v2.1"].format(video_key=key, **place), film, fps)
         lengths.append(len(columns["timestamp"]))
         statistics.append(_statistics(columns, frames))
         cameras = {key: _video_feature(film, fps) for key, film in frames.items()}
@@ -88,6 +93,40 @@ def write_v21(
     _write_info(root, "v2.1", lengths, described, fps, robot_type, **totals)
 
 
+def write_filmed_v30(
+    root: Path,
+    episodes: Iterable[FilmedRows],
+    features: Features,
+    task: str,
+    fps: int,
+    robot_type: str,
+) -> None:
+    """Write a complete data set; reads one episode at a time from the iterable.
+
+    Each episode has its own files, which v3.0 allows; there is at least one episode.
+    """
+    rows: list[dict[str, Any]] = []
+    described: dict[str, dict[str, Any]] = {}
+    for index, (own, frames) in enumerate(episodes):
+        first = rows[-1]["dataset_to_index"] if rows else 0
+        columns = _numbered(own, index, first)
+        length = len(columns["timestamp"])
+        place = {"chunk_index": index // _CHUNK, "file_index": index % _CHUNK}
+        data = root / _DATA["v3.0"].format(**place)
+        data.parent.mkdir(parents=True, exist_ok=True)
+        pq.write_table(_number_table(columns), data)
+        spans: dict[str, float] = {f"data/{name}": number for name, number in place.items()}
+        for key, film in frames.items():
+            _write_video(root / _VIDEO["v3.0"].format(video_key=key, **place), film, fps)
+            span = {**place, "from_timestamp": 0.0, "to_timestamp": length / fps}
+            spans |= {f"videos/{key}/{name}": value for name, value in span.items()}
+        rows.append(_shared_row(index, first, length, task) | spans)
+        cameras = {key: _video_feature(film, fps) for key, film in frames.items()}
+        described = _described(columns, cameras, features)
+    _write_shared_meta(root, rows, task)
+    _write_info(root, "v3.0", [row["length"] for row in rows], described, fps, robot_type)
+
+
 def write_v30(
     root: Path,
     columns: Columns,
@@ -104,12 +143,23 @@ def write_v30(
     columns = _numbered(columns, 0, 0)
     _write_rows(root / _DATA["v3.0"].format(**_FIRST), columns, images)
     rows = len(columns["timestamp"])
+    _write_shared_meta(root, [_shared_row(0, 0, rows, task)], task)
+    cameras = {key: {"dtype": "image", "names": ["height", "width", "channel"]} for key in images}
+    _write_info(root, "v3.0", [rows], _described(columns, cameras, features), fps)
+
+
+def _shared_row(index: int, first: int, length: int, task: str) -> dict[str, Any]:
+    """An episode's row of v3.0's `meta/episodes`, with its data in the first file."""
     places = [f"{kind}/{name}" for kind in ("data", "meta/episodes") for name in _FIRST]
-    counts = {"episode_index": 0, **dict.fromkeys(places, 0), "length": rows, "tasks": [task]}
-    spans = {"dataset_from_index": 0, "dataset_to_index": rows}
+    counts = {"episode_index": index, **dict.fromkeys(places, 0), "length": length, "tasks": [task]}
+    return counts | {"dataset_from_index": first, "dataset_to_index": first + length}
+
+
+def _write_shared_meta(root: Path, rows: list[dict[str, Any]], task: str) -> None:
+    """Write `meta/episodes` and `meta/tasks.parquet` of v3.0."""
     folder = root / "meta" / "episodes" / "chunk-000"
     folder.mkdir(parents=True)
-    pq.write_table(pa.Table.from_pylist([counts | spans]), folder / "file-000.parquet")
+    pq.write_table(pa.Table.from_pylist(rows), folder / "file-000.parquet")
     # LeRobot finds tasks by the index that pandas makes from this column.
     column = {"name": "task", "field_name": "task"}
     column |= {"pandas_type": "unicode", "numpy_type": "object"}
@@ -117,8 +167,6 @@ def write_v30(
     pandas = {"pandas": json.dumps(index)}
     tasks = pa.table({"task_index": [0], "task": [task]}, metadata=pandas)
     pq.write_table(tasks, root / "meta" / "tasks.parquet")
-    cameras = {key: {"dtype": "image", "names": ["height", "width", "channel"]} for key in images}
-    _write_info(root, "v3.0", [rows], _described(columns, cameras, features), fps)
 
 
 def write_sidecar(
@@ -170,11 +218,13 @@ def _write_info(
         "total_frames": sum(lengths),
         "total_tasks": 1,
         **totals,
-        "chunks_size": 1000,
+        "chunks_size": _CHUNK,
         "fps": int(fps) if float(fps).is_integer() else fps,
         "splits": {"train": f"0:{len(lengths)}"},
         "data_path": _DATA[version],
-        "video_path": _VIDEO if version == "v2.1" else None,
+        "video_path": _VIDEO[version]
+        if any(f["dtype"] == "video" for f in features.values())
+        else None,
         "features": features,
     }
     (root / MARKER).write_text(json.dumps(info, indent=4), encoding="utf-8")

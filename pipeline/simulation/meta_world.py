@@ -196,7 +196,8 @@ class MetaWorldEnvironment(gymnasium.Env[Any, NDArray[np.floating[Any]]]):
 
         renderer = _renderer(self._task, self._image)
         renderer.update_scene(self._simulator.data, VIEW)
-        for flag in (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION):
+        flags: Any = mujoco.mjtRndFlag  # pyright: ignore[reportAttributeAccessIssue]
+        for flag in (flags.mjRND_SHADOW, flags.mjRND_REFLECTION):
             renderer.scene.flags[flag] = self._shadows
         return np.ascontiguousarray(renderer.render()[::-1, ::-1])
 

@@ -18,6 +18,7 @@ from pipeline.base.errors import RecordingError
 from pipeline.data import content_digest, open_recording, open_recordings
 from pipeline.data.lerobot import action_kind
 from pipeline.data.lerobot_rows import read_clock
+from pipeline.data.lerobot_writer import FilmedRows, write_filmed_v30
 from pipeline.data.timeline import build_timeline
 from pipeline.look.recording.episode import view_episode
 from pipeline.look.recording.page import find_issues
@@ -842,3 +843,23 @@ def test_videos_of_one_path_are_refused(tmp_path, write):
     for recording in open_all(root):
         with refused(match=r"000000\.mp4: meta/ gives frames of .* to episode_00000\d and to epis"):
             recording.cameras()
+
+
+def test_episodes_that_are_written_with_films_are_read_again(tmp_path):
+    rng = np.random.default_rng(0)
+    filmed = []
+    for shade, rows in ((40, 5), (200, 8)):
+        columns = {"action": rng.random((rows, 2)).astype(np.float32)}
+        columns["timestamp"] = (np.arange(rows) / 10).astype(np.float32)
+        film = np.full((rows, 48, 64, 3), shade, np.uint8)
+        filmed.append(FilmedRows(columns, {VIEW_KEY: film}))
+    features = {"action": {"names": ["dx", "dy"], "kind": "delta"}}
+    write_filmed_v30(tmp_path / "set", iter(filmed), features, "push the T", 10, "arm")
+    for recording, written, shade in zip(
+        open_all(tmp_path / "set"), filmed, (40, 200), strict=True
+    ):
+        np.testing.assert_array_equal(recording.action().values, written.columns["action"])
+        assert recording.instruction == "push the T"
+        (camera,) = recording.cameras().values()
+        assert len(camera.time) == len(written.columns["timestamp"])
+        assert np.allclose(shades(camera.read([0])), shade, atol=3)

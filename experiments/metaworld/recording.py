@@ -1,0 +1,209 @@
+"""Scripted demonstrations of Meta-World's tasks: one LeRobot v3.0 set a task.
+
+    OUT/assembly-v3, OUT/bin-picking-v3, …    each with record.json: the seeds, and those that failed
+
+A row is a control step, 80 a second: the state and the frame before it, and the action that the
+scripted expert then took. Only episodes that end in success are kept. A set is the same, whatever
+number of processes made it.
+"""
+
+from collections import deque
+from collections.abc import Callable, Generator, Iterator, Sequence
+from concurrent.futures import Future, ProcessPoolExecutor
+from contextlib import closing
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any, Final, Literal, NamedTuple, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+from tqdm import tqdm
+
+from pipeline.base.border import Border, Document
+from pipeline.base.errors import ConfigError
+from pipeline.base.files import OutputKind, disk_full_named, remove_folder, there, write_document
+from pipeline.data.lerobot_writer import FilmedRows, write_filmed_v30
+from pipeline.simulation.meta_world import (
+    ACTION,
+    HZ,
+    STATE,
+    VIEW,
+    MetaWorldEnvironment,
+    full_name,
+    instruction_of,
+)
+
+Purpose = Literal["demonstrations", "validation", "evaluation"]
+_FIRST: Final[dict[Purpose, int]] = {
+    "demonstrations": 0,
+    "validation": 1_000_000,
+    "evaluation": 2_000_000,
+}
+SEEDS: Final = 10_000
+"""Episodes of a purpose for each number of a run; runs are numbered from 0 to 99."""
+_TRIED: Final = 4
+"""Seeds that are tried for each demonstration wanted, at most."""
+RECORD: Final = "record.json"
+_SET: Final = OutputKind("a set of demonstrations", lambda folder: folder.name.endswith(".part"))
+_BORDER: Final = Border(ConfigError, "Remove the folder that it is in and record again.")
+
+T = TypeVar("T")
+
+
+class Record(Document):
+    """The content of `record.json`."""
+
+    task: str
+    run: int
+    episodes: int
+    image: int
+    shadows: bool
+    seeds: tuple[int, ...] = ()
+    failed: tuple[int, ...] = ()
+    """Seeds whose episodes the expert failed; they are not in the set."""
+
+    @property
+    def wanted(self) -> dict[str, Any]:
+        """What it was asked for, without what came out."""
+        return self.model_dump(exclude={"seeds", "failed"})
+
+
+class Demonstration(NamedTuple):
+    """A finished episode; `rows` is None where the expert failed."""
+
+    seed: int
+    rows: FilmedRows | None
+
+
+def seeds_of(purpose: Purpose, run: int) -> range:
+    """Seeds of episodes: those of two purposes, or of two runs, have none in common.
+
+    Raises `ConfigError` for a run that is not from 0 to 99.
+    """
+    if not 0 <= run < 100:
+        raise ConfigError(f"--seed: expected a number from 0 to 99, found {run}")
+    first = _FIRST[purpose] + run * SEEDS
+    return range(first, first + SEEDS)
+
+
+def record(out: Path, wanted: Sequence[Record], jobs: int) -> list[Record]:
+    """Write the sets that are not there yet; returns the records of all.
+
+    Raises `ConfigError` where a set is there that was recorded otherwise, and where the expert
+    fails so often that too few seeds are left.
+    """
+    missing = [one for one in wanted if _finished(out, one) is None]
+    for one in missing:
+        # An unknown task is refused before anything is recorded.
+        MetaWorldEnvironment(one.task, one.image)
+    total = sum(one.episodes for one in wanted)
+    done = total - sum(one.episodes for one in missing)
+    with (
+        disk_full_named(out),
+        tqdm(None, "recording", total, initial=done, unit="episode", disable=None) as progress,
+        ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool,
+    ):
+        for one in missing:
+            _record_set(out, one, pool, jobs, progress)
+    return [kept for one in wanted if (kept := _finished(out, one)) is not None]
+
+
+def _record_set(
+    out: Path, wanted: Record, pool: ProcessPoolExecutor, jobs: int, progress: "tqdm[Any]"
+) -> None:
+    part = out / f".{wanted.task}.part"
+    remove_folder(part, _SET)
+    seeds: dict[bool, list[int]] = {True: [], False: []}
+
+    def kept() -> Iterator[FilmedRows]:
+        tried = seeds_of("demonstrations", wanted.run)[: _TRIED * wanted.episodes]
+        # One more than processes, so that none of them waits while an episode is written.
+        shown = in_order(pool, demonstrate, [(wanted, seed) for seed in tried], jobs + 1)
+        with closing(shown):
+            for seed, rows in shown:
+                seeds[rows is not None].append(seed)
+                if rows is not None:
+                    yield rows
+                    progress.update()
+                if len(seeds[True]) == wanted.episodes:
+                    return
+        raise ConfigError(
+            f"{wanted.task}: the scripted expert succeeded in {len(seeds[True])} of "
+            f"{len(tried)} episodes, expected {wanted.episodes}; ask for fewer with --episodes"
+        )
+
+    units = {"names": list(STATE.names), "units": list(STATE.units)}
+    moves = {"names": list(ACTION.names), "units": list(ACTION.units), "kind": "delta"}
+    features = {"observation.state": units, "action": moves}
+    write_filmed_v30(part, kept(), features, instruction_of(wanted.task), HZ, "meta_world_sawyer")
+    document = wanted.model_dump(mode="json") | {"seeds": seeds[True], "failed": seeds[False]}
+    write_document(part / RECORD, document)
+    part.rename(out / wanted.task)
+
+
+def demonstrate(wanted: Record, seed: int) -> Demonstration:
+    """One episode of the scripted expert, with a frame of each step."""
+    environment = MetaWorldEnvironment(wanted.task, wanted.image, wanted.shadows)
+    readings, _ = environment.reset(seed=seed)
+    states: list[NDArray[np.float32]] = []
+    actions: list[NDArray[np.float32]] = []
+    frames: list[NDArray[np.uint8]] = []
+    while not environment.finished:
+        states.append(readings["state"][0])
+        actions.append(environment.expert_action())
+        frames.append(environment.frames()[VIEW][1])
+        readings, *_ = environment.step(actions[-1])
+    columns = {
+        "observation.state": np.stack(states),
+        "action": np.stack(actions),
+        "timestamp": (np.arange(len(states)) / HZ).astype(np.float32),
+    }
+    film = {f"observation.images.{VIEW}": np.stack(frames)}
+    return Demonstration(seed, FilmedRows(columns, film) if environment.success else None)
+
+
+def in_order(
+    pool: ProcessPoolExecutor,
+    work: Callable[..., T],
+    arguments: Sequence[tuple[Any, ...]],
+    most: int,
+) -> Generator[T]:
+    """Results in the order of the arguments; no more than `most` are begun and not yet taken."""
+    waiting: deque[Future[T]] = deque()
+    rest = iter(arguments)
+    try:
+        while True:
+            while len(waiting) < most and (next_arguments := next(rest, None)) is not None:
+                waiting.append(pool.submit(work, *next_arguments))
+            if not waiting:
+                return
+            yield waiting.popleft().result()
+    finally:
+        for future in waiting:
+            future.cancel()
+
+
+def recorded(out: Path, task: str) -> Record:
+    """The record of a set.
+
+    Raises `ConfigError` where there is none.
+    """
+    return _BORDER.read_json(out / full_name(task) / RECORD, Record)
+
+
+def _finished(out: Path, wanted: Record) -> Record | None:
+    """The record of a set that is there; None where there is no folder.
+
+    Raises `ConfigError` where what is there was recorded otherwise.
+    """
+    folder = out / wanted.task
+    if not there(folder):
+        return None
+    kept = recorded(out, wanted.task)
+    if kept.wanted != wanted.wanted:
+        differ = [f"{k} {v}" for k, v in kept.wanted.items() if wanted.wanted[k] != v]
+        raise ConfigError(
+            f"{folder / RECORD}: expected a set as asked for now, found one with "
+            f"{', '.join(differ)}. Move it away, or record to another folder (--out)"
+        )
+    return kept
