@@ -36,7 +36,7 @@ def test_a_set_is_what_the_expert_did_and_is_recorded_once(tmp_path: Path) -> No
     assert truth is not None
     first = opened[0]
     action, state = first.action(), first.state()
-    assert state is not None and action.kind == "delta"
+    assert state is not None and action is not None and action.kind == "delta"
     np.testing.assert_array_equal(action.values, truth.columns["action"])
     np.testing.assert_array_equal(state.values, truth.columns["observation.state"])
     assert np.allclose(np.diff(state.time), 1 / HZ, atol=1e-6)

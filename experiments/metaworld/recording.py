@@ -1,6 +1,6 @@
 """Scripted demonstrations of Meta-World's tasks: one LeRobot v3.0 set a task.
 
-    OUT/assembly-v3, OUT/bin-picking-v3, …    each with record.json: the seeds, and those that failed
+    OUT/assembly-v3, …    the set, and record.json: its seeds, and those that the expert failed
 
 A row is a control step, 80 a second: the state and the frame before it, and the action that the
 scripted expert then took. Only episodes that end in success are kept. A set is the same, whatever
