@@ -1,5 +1,6 @@
 """The recorder of Meta-World's demonstrations."""
 
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,10 @@ from pipeline.base.config import Source
 from pipeline.base.errors import ConfigError
 from pipeline.data import open_recordings
 from pipeline.simulation.meta_world import HZ, VIEW, instruction_of
+
+needs_meta_world = pytest.mark.skipif(
+    find_spec("metaworld") is None, reason="needs the extra `metaworld`"
+)
 
 
 def test_no_two_purposes_or_runs_share_an_episode() -> None:
@@ -23,9 +28,9 @@ def test_no_two_purposes_or_runs_share_an_episode() -> None:
         seeds_of("validation", 100)
 
 
+@needs_meta_world
 @pytest.mark.extra
 def test_a_set_is_what_the_expert_did_and_is_recorded_once(tmp_path: Path) -> None:
-    pytest.importorskip("metaworld")
     asked = Record(task="button-press-topdown-v3", run=0, episodes=2, image=48, shadows=False)
     (kept,) = record(tmp_path, [asked], jobs=1)
     assert len(kept.seeds) == 2 and {*kept.seeds} <= {*seeds_of("demonstrations", 0)}

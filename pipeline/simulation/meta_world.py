@@ -247,7 +247,17 @@ def _expert(name: str) -> Any:
 
 @cache
 def _renderer(name: str, image: int) -> Any:
-    """Draws all environments of a task: MuJoCo mixes up contexts that are freed and made anew."""
+    """Draws all environments of a task: MuJoCo mixes up contexts that are freed and made anew.
+
+    Raises `ConfigError` where MuJoCo cannot draw on this machine.
+    """
     import mujoco
 
-    return mujoco.Renderer(_simulator(name).model, image, image)
+    try:
+        return mujoco.Renderer(_simulator(name).model, image, image)
+    except Exception as error:  # each of its ways to draw has errors of its own
+        raise ConfigError(
+            f"metaworld:{name}: MuJoCo cannot draw frames with MUJOCO_GL="
+            f"{os.environ.get('MUJOCO_GL', '')}: {error}. Without a display it needs osmesa "
+            "(Debian: libosmesa6) or egl; set MUJOCO_GL before mujoco is imported"
+        ) from error

@@ -1,6 +1,7 @@
 """Meta-World's tasks as environments; most tests need the extra `metaworld`."""
 
 import sys
+from importlib.util import find_spec
 
 import gymnasium
 import numpy as np
@@ -15,6 +16,10 @@ from pipeline.simulation.meta_world import (
     MetaWorldEnvironment,
     choose_drawing,
     instruction_of,
+)
+
+needs_meta_world = pytest.mark.skipif(
+    find_spec("metaworld") is None, reason="needs the extra `metaworld`"
 )
 
 
@@ -43,9 +48,9 @@ def test_any_task_has_an_instruction():
     assert instruction_of("window-close") == "Window close."
 
 
+@needs_meta_world
 @pytest.mark.extra
 def test_the_same_seed_is_the_same_episode_and_ends_as_the_task_says():
-    pytest.importorskip("metaworld")
     environment = MetaWorldEnvironment("button-press-topdown")
     states = play(environment, 4)
     assert environment.outcome == SUCCEEDED and environment.success
@@ -61,9 +66,9 @@ def test_the_same_seed_is_the_same_episode_and_ends_as_the_task_says():
     assert (terminated, truncated, info["reason"]) == (False, True, TIME_IS_UP)
 
 
+@needs_meta_world
 @pytest.mark.extra
 def test_an_action_is_in_millimetres_and_only_finite_ones_are_taken():
-    pytest.importorskip("metaworld")
     environment = MetaWorldEnvironment("drawer-open")
     (before,) = environment.reset(seed=0)[0]["state"]
     for _ in range(10):
@@ -75,16 +80,16 @@ def test_an_action_is_in_millimetres_and_only_finite_ones_are_taken():
         environment.step(np.full(4, np.nan))
 
 
+@needs_meta_world
 @pytest.mark.extra
 def test_an_unknown_task_lists_those_that_are_there():
-    pytest.importorskip("metaworld")
     with pytest.raises(ConfigError, match=r"metaworld:knitting-v3: .*, assembly-v3|assembly-v3, "):
         MetaWorldEnvironment("knitting")
 
 
+@needs_meta_world
 @pytest.mark.extra
 def test_frames_show_the_arm_upright():
-    pytest.importorskip("metaworld")
     environment = MetaWorldEnvironment("drawer-open", image=64)
     environment.reset(seed=0)
     ((view, (time_s, frame)),) = environment.frames().items()
