@@ -4,6 +4,7 @@ A tick is one control step of Meta-World, 12.5 ms: its scripted experts decide a
 policies, and `vlm_reuse_count` says how many ticks share one picture. Needs the extra `metaworld`.
 """
 
+import atexit
 import os
 import warnings
 from collections.abc import Mapping
@@ -261,3 +262,6 @@ def _renderer(name: str, image: int) -> Any:
             f"{os.environ.get('MUJOCO_GL', '')}: {error}. Without a display it needs osmesa "
             "(Debian: libosmesa6) or egl; set MUJOCO_GL before mujoco is imported"
         ) from error
+
+
+atexit.register(_renderer.cache_clear)  # before the modules that a renderer needs to close
