@@ -7,13 +7,12 @@ scripted expert then took. Only episodes that end in success are kept. A set is 
 number of processes made it.
 """
 
-from collections import deque
-from collections.abc import Callable, Generator, Iterator, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from contextlib import closing
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Any, Final, Literal, NamedTuple, TypeVar
+from typing import Any, Final, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +20,7 @@ from tqdm import tqdm
 
 from pipeline.base.border import Border, Document
 from pipeline.base.errors import ConfigError
-from pipeline.base.files import OutputKind, disk_full_named, remove_folder, there, write_document
+from pipeline.base.files import OutputKind, replace_folder, there, write_document
 from pipeline.data.lerobot_writer import FilmedRows, write_filmed_v30
 from pipeline.simulation.meta_world import (
     ACTION,
@@ -44,10 +43,8 @@ SEEDS: Final = 10_000
 _TRIED: Final = 4
 """Seeds that are tried for each demonstration wanted, at most."""
 RECORD: Final = "record.json"
-_SET: Final = OutputKind("a set of demonstrations", lambda folder: folder.name.endswith(".part"))
+_SET: Final = OutputKind("a set of demonstrations", lambda folder: (folder / RECORD).is_file())
 _BORDER: Final = Border(ConfigError, "Remove the folder that it is in and record again.")
-
-T = TypeVar("T")
 
 
 class Record(Document):
@@ -99,7 +96,6 @@ def record(out: Path, wanted: Sequence[Record], jobs: int) -> list[Record]:
     total = sum(one.episodes for one in wanted)
     done = total - sum(one.episodes for one in missing)
     with (
-        disk_full_named(out),
         tqdm(None, "recording", total, initial=done, unit="episode", disable=None) as progress,
         ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool,
     ):
@@ -111,14 +107,16 @@ def record(out: Path, wanted: Sequence[Record], jobs: int) -> list[Record]:
 def _record_set(
     out: Path, wanted: Record, pool: ProcessPoolExecutor, jobs: int, progress: "tqdm[Any]"
 ) -> None:
-    part = out / f".{wanted.task}.part"
-    remove_folder(part, _SET)
+    from pipeline.extract.engine import in_background  # no process that draws needs torch
+
     seeds: dict[bool, list[int]] = {True: [], False: []}
+
+    def on_a_core(seed: int) -> Demonstration:
+        return pool.submit(demonstrate, wanted, seed).result()
 
     def kept() -> Iterator[FilmedRows]:
         tried = seeds_of("demonstrations", wanted.run)[: _TRIED * wanted.episodes]
-        # One more than processes, so that none of them waits while an episode is written.
-        shown = in_order(pool, demonstrate, [(wanted, seed) for seed in tried], jobs + 1)
+        shown = in_background(tried, on_a_core, jobs)
         with closing(shown):
             for seed, rows in shown:
                 seeds[rows is not None].append(seed)
@@ -132,13 +130,16 @@ def _record_set(
             f"{len(tried)} episodes, expected {wanted.episodes}; ask for fewer with --episodes"
         )
 
-    units = {"names": list(STATE.names), "units": list(STATE.units)}
-    moves = {"names": list(ACTION.names), "units": list(ACTION.units), "kind": "delta"}
-    features = {"observation.state": units, "action": moves}
-    write_filmed_v30(part, kept(), features, instruction_of(wanted.task), HZ, "meta_world_sawyer")
-    document = wanted.model_dump(mode="json") | {"seeds": seeds[True], "failed": seeds[False]}
-    write_document(part / RECORD, document)
-    part.rename(out / wanted.task)
+    def write(folder: Path) -> None:
+        units = {"names": list(STATE.names), "units": list(STATE.units)}
+        moves = {"names": list(ACTION.names), "units": list(ACTION.units), "kind": "delta"}
+        features = {"observation.state": units, "action": moves}
+        task = instruction_of(wanted.task)
+        write_filmed_v30(folder, kept(), features, task, HZ, "meta_world_sawyer")
+        document = wanted.model_dump(mode="json") | {"seeds": seeds[True], "failed": seeds[False]}
+        write_document(folder / RECORD, document)
+
+    replace_folder(out / wanted.task, write, _SET)
 
 
 def demonstrate(wanted: Record, seed: int) -> Demonstration:
@@ -160,27 +161,6 @@ def demonstrate(wanted: Record, seed: int) -> Demonstration:
     }
     film = {f"observation.images.{VIEW}": np.stack(frames)}
     return Demonstration(seed, FilmedRows(columns, film) if environment.success else None)
-
-
-def in_order(
-    pool: ProcessPoolExecutor,
-    work: Callable[..., T],
-    arguments: Sequence[tuple[Any, ...]],
-    most: int,
-) -> Generator[T]:
-    """Results in the order of the arguments; no more than `most` are begun and not yet taken."""
-    waiting: deque[Future[T]] = deque()
-    rest = iter(arguments)
-    try:
-        while True:
-            while len(waiting) < most and (next_arguments := next(rest, None)) is not None:
-                waiting.append(pool.submit(work, *next_arguments))
-            if not waiting:
-                return
-            yield waiting.popleft().result()
-    finally:
-        for future in waiting:
-            future.cancel()
 
 
 def recorded(out: Path, task: str) -> Record:

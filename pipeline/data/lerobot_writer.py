@@ -69,11 +69,7 @@ def write_v21(
     for index, (own, frames) in enumerate(episodes):
         columns = _numbered(own, index, sum(lengths))
         place = {"episode_chunk": 0, "episode_index": index}
-        data = root / _DATA["v2.1"].format(**place)
-        data.parent.mkdir(parents=True, exist_ok=True)
-        pq.write_table(_number_table(columns), data)
-        for key, film in frames.items():
-            _write_video(root / _VIDEO["v2.1"].format(video_key=key, **place), film, fps)
+        _write_filmed(root, "v2.1", place, FilmedRows(columns, frames), fps)
         lengths.append(len(columns["timestamp"]))
         statistics.append(_statistics(columns, frames))
         cameras = {key: _video_feature(film, fps) for key, film in frames.items()}
@@ -112,12 +108,9 @@ def write_filmed_v30(
         columns = _numbered(own, index, first)
         length = len(columns["timestamp"])
         place = {"chunk_index": index // _CHUNK, "file_index": index % _CHUNK}
-        data = root / _DATA["v3.0"].format(**place)
-        data.parent.mkdir(parents=True, exist_ok=True)
-        pq.write_table(_number_table(columns), data)
+        _write_filmed(root, "v3.0", place, FilmedRows(columns, frames), fps)
         spans: dict[str, float] = {f"data/{name}": number for name, number in place.items()}
-        for key, film in frames.items():
-            _write_video(root / _VIDEO["v3.0"].format(video_key=key, **place), film, fps)
+        for key in frames:
             span = {**place, "from_timestamp": 0.0, "to_timestamp": length / fps}
             spans |= {f"videos/{key}/{name}": value for name, value in span.items()}
         rows.append(_shared_row(index, first, length, task) | spans)
@@ -125,6 +118,17 @@ def write_filmed_v30(
         described = _described(columns, cameras, features)
     _write_shared_meta(root, rows, task)
     _write_info(root, "v3.0", [row["length"] for row in rows], described, fps, robot_type)
+
+
+def _write_filmed(
+    root: Path, version: str, place: Mapping[str, int], episode: FilmedRows, fps: int
+) -> None:
+    """Write the files of one episode: its numbered columns, and a video a view."""
+    data = root / _DATA[version].format(**place)
+    data.parent.mkdir(parents=True, exist_ok=True)
+    pq.write_table(_number_table(episode.columns), data)
+    for key, film in episode.frames.items():
+        _write_video(root / _VIDEO[version].format(video_key=key, **place), film, fps)
 
 
 def write_v30(

@@ -96,7 +96,7 @@ class StorePlaces:
         Raises `ConfigError` where something else lies in the previous store's place.
         """
         lost, contents, lines = self._lost(surveyed), surveyed.contents, list[str]()
-        other = lost is None and self._has_other_episodes(surveyed)
+        other = lost is None and self._may_have_other_rows(surveyed)
         if lost and self.finished:
             refuse_foreign(self.previous, KEPT)
             lines.append(
@@ -143,7 +143,7 @@ class StorePlaces:
         if not _keys(self.previous) - _keys(self.target):
             remove_folder(self.previous, KEPT)
 
-    def _has_other_episodes(self, surveyed: Survey) -> bool:
+    def _may_have_other_rows(self, surveyed: Survey) -> bool:
         """Whether the store may have rows that this run does not make."""
         if self.finished in (None, surveyed.plan) or self.repaired:
             return False

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from pipeline.base.errors import ConfigError
 from pipeline.data.recording import ActionKind, Channels
+from pipeline.simulation.environment import Readings, Shots
 
 HZ: Final = 80
 MAX_TICKS: Final = 500
@@ -43,10 +44,6 @@ _STEP_MM: Final = 10.0
 """How far an action of 1 moves the setpoint of Meta-World."""
 _BOUND: Final = np.array([_STEP_MM, _STEP_MM, _STEP_MM, 1.0])
 _LARGEST: Final = 1e4
-
-Readings = dict[str, NDArray[Any]]
-Shots = dict[str, tuple[float, NDArray[np.uint8]]]
-"""By view: the capture time of its newest frame in s, and the frame (height, width, 3), RGB."""
 
 
 class MetaWorldRobot(NamedTuple):
