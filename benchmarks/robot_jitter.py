@@ -47,8 +47,7 @@ from pipeline.robot.realtime import PolicySession, RunSettings, run_robot
 from pipeline.robot.run_report import ANSWER_PARTS, TICK_PARTS, RunReport, Timings
 from pipeline.robot.session import ServedPolicy
 from pipeline.simulation.environment import SimulatedRobot
-from pipeline.simulation.insertion import TICK_HZ
-from pipeline.simulation.insertion_formats import INSTRUCTION
+from pipeline.simulation.insertion import INSTRUCTION, TICK_HZ
 from pipeline.simulation.rendering import VIEWS
 from pipeline.vlm.demo_checkpoint import write_demo_checkpoint
 from pipeline.vlm.live import live_spec

@@ -29,8 +29,7 @@ from experiments.recipes import LARGE_IMAGES
 from pipeline.base.config import load_params
 from pipeline.base.machine import resolve_device
 from pipeline.robot.live_features import LiveFeatures
-from pipeline.simulation.insertion import NeedleInsertion
-from pipeline.simulation.insertion_formats import INSTRUCTION
+from pipeline.simulation.insertion import INSTRUCTION, NeedleInsertion
 from pipeline.simulation.rendering import VIEWS, photograph, through_jpeg
 from pipeline.vlm.live import live_spec
 

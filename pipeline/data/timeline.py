@@ -98,7 +98,7 @@ def build_timeline(
     elif poses is not None:
         clocks["pose"] = poses.time
         time, action = _pose_ticks(recording, poses, clocks, action_hz, action_rotation)
-        channels, kind = _pose_channels(action_rotation), "delta"
+        channels, kind = pose_channels(action_rotation), "delta"
     else:
         raise RecordingError(f"{recording.path}: neither actions nor poses to derive them from")
     vl_time = time[::vlm_reuse_count]
@@ -205,11 +205,12 @@ def _redo_rotation(
     return (
         action_rotation == "rotvec"
         and poses is not None
-        and recorded.channels == _pose_channels("euler_delta")
+        and recorded.channels == pose_channels("euler_delta")
     )
 
 
-def _pose_channels(action_rotation: ActionRotation) -> Channels:
+def pose_channels(action_rotation: ActionRotation) -> Channels:
+    """The channels of actions that are derived from poses."""
     names = (*_TRANSLATION, *_ROTATION[action_rotation], "gripper")
     return Channels(names, ("mm",) * 3 + ("deg",) * 3 + ("",))
 

@@ -1,4 +1,4 @@
-"""A policy drives the simulated insertion closed loop, in this process or over the wire.
+"""A policy drives a simulated robot closed loop, in this process or over the wire.
 
 `_Driver` runs all episodes and steps several environments together. It has two kinds: one gets its
 chunks from a policy in this process, the other from a server. The same seeds give the same figures,
@@ -7,9 +7,10 @@ bit for bit on one machine.
 
 import os
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any, ClassVar, Final, Generic, TypeVar
 
 import numpy as np
@@ -19,7 +20,13 @@ from torch import Tensor
 from tqdm import tqdm
 
 from pipeline.base.commands import command
-from pipeline.base.config import Level, RolloutAblation, RolloutParams, latencies_ms
+from pipeline.base.config import (
+    PHANTOM,
+    RolloutAblation,
+    RolloutParams,
+    environments,
+    latencies_ms,
+)
 from pipeline.base.errors import CheckpointMismatch, ConfigError
 from pipeline.base.observation import Observation
 from pipeline.evaluate.rollouts import (
@@ -41,9 +48,8 @@ from pipeline.robot.loop import ControlLoop, Executor, SafeStop, check_chunking
 from pipeline.robot.readings import RobotMemory, SeenFeatures
 from pipeline.robot.session import stack_guides
 from pipeline.simulation.environment import InsertionEnvironment
-from pipeline.simulation.insertion import INSERTED, TICK_HZ, NeedleInsertion
-from pipeline.simulation.insertion_formats import INSTRUCTION
-from pipeline.simulation.rendering import VIEWS, photograph
+from pipeline.simulation.environments import environment_maker
+from pipeline.simulation.interface import Action, EnvironmentRobot, RobotEnvironment, Shots
 
 SIDE_BY_SIDE: Final = 50
 """Environments that are stepped together and share passes of a model in this process."""
@@ -69,9 +75,9 @@ def roll_out(
     line for each controller when its episodes have ended. If the policy uses features,
     `load_features` is called after everything else was checked, and before the first episode the
     model proves that it gives the policy's features (`prove`). Raises `CheckpointMismatch` where
-    the phantom lacks what the policy was trained on, and `ConfigError` for an instruction that the
-    policy was not trained on, for chunking that its expert cannot do and for more steps than a
-    chunk has.
+    an environment lacks what the policy was trained on, and `ConfigError` for an unknown
+    environment, for an instruction that the policy was not trained on, for chunking that its expert
+    cannot do and for more steps than a chunk has.
     """
     shape, source = checkpoint.shape, checkpoint.source
     metadata = {key: source[key] for key in ("streams", "action_hz", "vlm_reuse_count")} | {
@@ -86,17 +92,23 @@ def roll_out(
         "uses_features": "features" in policy.encoders,
     }
     widths = {"action": shape.action_dim, "state": shape.state_dim, "sensor": shape.sensor_channels}
-    driver = _LocalDriver(metadata, widths, wanted, checkpoint, policy, act or policy.act)
+    drivers = [
+        _LocalDriver(metadata, widths, wanted, make, checkpoint, policy, act or policy.act)
+        for make in _environments(metadata, wanted)
+    ]
+    features = None
     if metadata["uses_features"]:
-        driver.features = load_features()
-        prove(checkpoint, driver.features, say)
+        features = load_features()
+        prove(checkpoint, features, say)
     alone = len(policy.encoders) == 1
     ablations: list[RolloutAblation] = [
         ablation
         for ablation in dict.fromkeys(wanted.ablations)
         if ablation.split()[0] in policy.encoders and not (alone and ablation.endswith("off"))
     ]
-    return driver.run(ablations, say)
+    for driver in drivers:
+        driver.features = features
+    return _all(drivers, ablations, say)
 
 
 def roll_out_served(
@@ -113,75 +125,92 @@ def roll_out_served(
         name: len(streams[name]["names"]) if streams.get(name) else 0
         for name in ("action", "state", "sensor")
     }
-    return _ServedDriver(server.metadata, widths, wanted, server).run((), say)
+    makers = _environments(server.metadata, wanted)
+    drivers = [_ServedDriver(server.metadata, widths, wanted, make, server) for make in makers]
+    return _all(drivers, (), say)
 
 
-def _refuse_other_robot(source: Mapping[str, Any], widths: Mapping[str, int]) -> None:
-    """Raise `CheckpointMismatch` where the phantom lacks what a policy was trained on.
+def _environments(
+    source: Mapping[str, Any], wanted: RolloutParams
+) -> list[Callable[[], RobotEnvironment]]:
+    """What makes each environment of `rollout.environment`, for a policy of this source."""
+    names = source["streams"]["action"]["names"]
+    return [
+        environment_maker(name, wanted.level, names) for name in environments(wanted.environment)
+    ]
+
+
+def _all(
+    drivers: "Sequence[_Driver[Any]]",
+    ablations: Sequence[RolloutAblation],
+    say: Callable[[str], None],
+) -> Rollouts:
+    """The rollouts of all drivers, one after another."""
+    wanted, metadata = drivers[0].wanted, drivers[0].metadata
+    episodes = [episode for driver in drivers for episode in driver.run(ablations, say)]
+    settings = wanted.model_dump(mode="json", exclude={"checkpoint", "output", "device"})
+    described = ("checkpoint", "step", "weights", "model_type")
+    settings |= {key: metadata[key] for key in described}
+    told = {driver.robot.level: driver.instruction for driver in drivers}
+    settings["instruction"] = told if len(drivers) > 1 else drivers[0].instruction
+    return Rollouts(settings["checkpoint"], settings, tuple(episodes))
+
+
+def _refuse_other_robot(
+    source: Mapping[str, Any], widths: Mapping[str, int], robot: EnvironmentRobot
+) -> None:
+    """Raise `CheckpointMismatch` where an environment lacks what a policy was trained on.
 
     `source` has `streams` and `action_hz`; `widths` are those of action, state and sensor, 0 for a
     stream that the policy does not use.
     """
     streams, hz = source["streams"], source["action_hz"]
-    kind, own = streams["action"]["kind"], {"action": (7,), "state": (0, 12), "sensor": (0, 1026)}
-    fits = all(widths[name] in known for name, known in own.items())
-    if not (fits and kind == "delta" and hz == TICK_HZ and set(streams["views"]) <= set(VIEWS)):
-        channels = ", ".join(f"{name} channels {width}" for name, width in widths.items())
+    kind, views = streams["action"]["kind"], streams["views"]
+    own = {name: len(channels.names) if channels else 0 for name, channels in robot.streams.items()}
+    fits = all(width in (own[name], 0) for name, width in widths.items())
+    same = kind == robot.action_kind and hz == robot.hz and set(views) <= set(robot.views)
+    if not (fits and same and widths["action"]):
         raise CheckpointMismatch(
-            "rollout.environment: the policy was trained on another robot than the phantom: views "
-            f"{', '.join(streams['views'])}, action {kind}, {channels}, action_hz {hz}, of the "
-            f"phantom views {', '.join(VIEWS)}, action delta, action channels 7, state channels "
-            f"12, sensor channels 1026, action_hz {TICK_HZ}. Judge it on its own recordings "
-            f"({command('evaluate')}) and set rollout.environment to null, which leaves "
+            f"rollout.environment: the policy was trained on another robot than {robot.name}: "
+            f"{_described(views, kind, widths, hz)}, of {robot.name} "
+            f"{_described(robot.views, robot.action_kind, own, robot.hz)}. Judge it on its own "
+            f"recordings ({command('evaluate')}) and set rollout.environment to null, which leaves "
             "rollouts out of dvc repro."
         )
 
 
-def _instruction_of(trained: Sequence[str]) -> str:
-    """The instruction for the robot: the phantom's task, or the only one of the training.
+def _described(views: Sequence[str], kind: str, widths: Mapping[str, int], hz: float) -> str:
+    channels = ", ".join(f"{name} channels {width}" for name, width in widths.items())
+    return f"views {', '.join(views)}, action {kind}, {channels}, action_hz {hz:g}"
+
+
+def _instruction_of(trained: Sequence[str], robot: EnvironmentRobot) -> str:
+    """The instruction for the robot: its environment's, or the only one of the training.
 
     Raises `ConfigError` where the policy was trained on several others.
     """
-    if not trained or INSTRUCTION in trained:
-        return INSTRUCTION
+    if not trained or robot.instruction in trained:
+        return robot.instruction
     if len(trained) == 1:
         return trained[0]
     raise ConfigError(
-        f"rollout: the policy was trained on other instructions than {INSTRUCTION!r}: "
-        f"{', '.join(map(repr, trained))}. Train it on the phantom's, or on one: "
+        f"rollout: the policy was trained on other instructions than {robot.instruction!r}: "
+        f"{', '.join(map(repr, trained))}. Train it on that of {robot.name}, or on one: "
         "data.sources[].instruction"
     )
 
 
-def _begin_episode(source: Mapping[str, Any], level: Level, seed: int) -> InsertionEnvironment:
-    """The phantom at the beginning of an episode, with actions as in a policy's `source`."""
-    rotation = "rotvec" if "rx" in source["streams"]["action"]["names"] else "euler_delta"
-    environment = InsertionEnvironment(level, rotation, cameras=False)
+def _played_again(
+    environment: RobotEnvironment, seed: int, actions: Sequence[Action], after: Sequence[int]
+) -> list[Shots]:
+    """The frames that were newest after so many of these actions, of the episode of this seed."""
     environment.reset(seed=seed)
-    return environment
-
-
-def _episode(
-    controller: str, level: str, insertion: NeedleInsertion, stop: str | None
-) -> RolloutEpisode:
-    """The record of an episode that has ended, by its outcome or by a safe stop."""
-    progress, trace = insertion.progress, insertion.trace()
-    reason = stop or str(insertion.outcome)
-    return RolloutEpisode(
-        controller=controller,
-        seed=insertion.layout.seed,
-        level=level,
-        success=reason == INSERTED,
-        reason=reason,
-        lateral_mm=float(np.hypot(*trace.lateral_mm)),
-        depth_mm=float(trace.layer_mm[-1]),
-        overshoot_mm=progress.overshoot_mm,
-        max_force_n=progress.max_force_n,
-        time_s=insertion.time_s,
-        ticks=len(trace.time_s),
-        trace=trace,
-        frames=lambda time_s: {view: photograph(view, insertion, time_s) for view in VIEWS},
-    )
+    shots = {0: environment.frames()} if 0 in after else {}
+    for played, action in enumerate(actions[: max(after)], 1):
+        environment.step(action)
+        if played in after:
+            shots[played] = environment.frames()
+    return [shots[played] for played in after]
 
 
 @dataclass
@@ -202,10 +231,51 @@ Memory = TypeVar("Memory", RobotMemory, _Unsent)
 
 
 @dataclass
-class _Robot(Generic[Memory]):
-    """One environment with its control loop, and why it stopped safely."""
+class _Episode:
+    """An episode of an environment under way; it begins when this is made."""
 
-    environment: InsertionEnvironment
+    environment: RobotEnvironment
+    seed: int
+    actions: list[Action] = field(default_factory=list[Action])
+    ended: bool = False
+    info: Mapping[str, Any] = field(default_factory=dict[str, Any])
+
+    def __post_init__(self) -> None:
+        self.readings, self.info = self.environment.reset(seed=self.seed)
+
+    def step(self, action: Action) -> None:
+        """Carry out one tick."""
+        self.readings, _, done, late, self.info = self.environment.step(action)
+        self.ended = done or late
+        self.actions.append(action)
+
+    def record(self, controller: str, stop: str | None = None) -> RolloutEpisode:
+        """The record of the episode, which has ended, by its outcome or by a safe stop."""
+        environment, robot = self.environment, self.environment.robot
+        success = stop is None and bool(self.info["success"])
+        ended = self.info.get("reason", "succeeded" if success else "failed")
+        time_s = float(self.readings["time"][0])
+        insertion = isinstance(environment, InsertionEnvironment)
+        return RolloutEpisode(
+            controller=controller,
+            seed=self.seed,
+            level=robot.level,
+            success=success,
+            reason=stop or str(ended),
+            figures=environment.figures(),
+            time_s=time_s,
+            ticks=round(time_s * robot.hz),
+            frames=partial(_played_again, environment, self.seed, self.actions),
+            actions=len(self.actions),
+            trace=environment.insertion.trace() if insertion else None,
+        )
+
+
+@dataclass
+class _Robot(Generic[Memory]):
+    """One episode with its control loop, and why it stopped safely."""
+
+    episode: _Episode
     loop: ControlLoop
     memory: Memory
     latency_s: float
@@ -220,11 +290,16 @@ class _Robot(Generic[Memory]):
     first: dict[str, NDArray[Any]] = field(default_factory=dict[str, NDArray[Any]])
     """The fields of a frozen stream as they were first."""
 
-    def sense(self, readings: Readings) -> None:
+    @property
+    def environment(self) -> RobotEnvironment:
+        """Where the robot is."""
+        return self.episode.environment
+
+    def sense(self) -> None:
         """Begin a tick with the readings since the last one."""
         self.loop.begin_tick()
-        self.time_s = float(readings["time"][0])
-        self.memory.sense(readings)
+        self.time_s = float(self.episode.readings["time"][0])
+        self.memory.sense(self.episode.readings)
         self._end_pass()
 
     def see(self, seen: Any) -> None:
@@ -249,13 +324,22 @@ class _Robot(Generic[Memory]):
     def step(self) -> None:
         """Act for one tick; stand still until the first chunk has come."""
         action = self.loop.action()
-        still = np.zeros(self.environment.action_space.shape or ())
-        self.sense(self.environment.step(still if action is None else action)[0])
+        self.episode.step(self.environment.still() if action is None else action)
+        self.sense()
 
     @property
     def active(self) -> bool:
         """Whether the episode goes on."""
-        return self.stop is None and not self.environment.insertion.finished
+        return self.stop is None and not self.episode.ended
+
+
+def _shots(robots: Sequence[_Robot[Any]]) -> list[Shots]:
+    """The newest frames of each robot."""
+    if not robots[0].environment.draws_in_threads:
+        return [robot.environment.frames() for robot in robots]
+    # Threads are enough: drawing and compressing, which take most of the time, run in parallel.
+    with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
+        return [*pool.map(lambda robot: robot.environment.frames(), robots)]
 
 
 @dataclass
@@ -269,18 +353,24 @@ class _Driver(ABC, Generic[Memory]):
     widths: Mapping[str, int]
     """Channels of action, state and sensor; 0 for a stream that the policy does not use."""
     wanted: RolloutParams
+    make: Callable[[], RobotEnvironment]
 
     def __post_init__(self) -> None:
-        _refuse_other_robot(self.metadata, self.widths)
+        self.environments = [self.make()]
+        """They are used again: what an environment loads, such as a scene, is loaded once."""
+        self.robot = self.environments[0].robot
+        _refuse_other_robot(self.metadata, self.widths, self.robot)
         check_chunking(self.wanted.chunking, self.metadata["stochastic"])
         self._executor()
-        self.instruction = _instruction_of(self.metadata["instructions"])
+        self.instruction = _instruction_of(self.metadata["instructions"], self.robot)
 
     def _executor(self) -> Executor:
         wanted, metadata = self.wanted, self.metadata
         return Executor(wanted.chunking, wanted.execute, metadata["horizon"], metadata["moving"])
 
-    def run(self, ablations: Sequence[RolloutAblation], say: Callable[[str], None]) -> Rollouts:
+    def run(
+        self, ablations: Sequence[RolloutAblation], say: Callable[[str], None]
+    ) -> list[RolloutEpisode]:
         """Run the policy with each latency, then with each ablation, and the demonstrator."""
         wanted = self.wanted
         seeds = range(wanted.seed, wanted.seed + wanted.episodes)
@@ -294,45 +384,56 @@ class _Driver(ABC, Generic[Memory]):
             *((late_name(latency_ms), latency_ms, None) for latency_ms in others_ms),
             *((ablation, first_ms, ablation) for ablation in ablations),
         ]
+        where = "" if self.robot.name == PHANTOM else f"{self.robot.level}, "
         with tqdm(total=(1 + len(ways)) * len(seeds), unit="episode", disable=None) as bar:
             for controller, latency_ms, ablation in ways:
                 bar.set_description(controller)
                 for group in groups:
-                    robots = [self._begin(seed, latency_ms / 1000, ablation) for seed in group]
+                    robots = self._begin(group, latency_ms / 1000, ablation)
                     self._drive(robots, bar)
-                    episodes += [
-                        _episode(controller, wanted.level, robot.environment.insertion, robot.stop)
-                        for robot in robots
-                    ]
+                    episodes += [robot.episode.record(controller, robot.stop) for robot in robots]
                 rate = SuccessRate.of([e.success for e in episodes if e.controller == controller])
-                say(f"{controller_name(controller)}: {rate} of {rate.episodes} episodes")
+                say(f"{where}{controller_name(controller)}: {rate} of {rate.episodes} episodes")
             bar.set_description(EXPERT)
-            for seed in seeds:
-                insertion = _begin_episode(self.metadata, wanted.level, seed).insertion
-                while not insertion.finished:
-                    insertion.step(insertion.expert_action())
-                episodes.append(_episode(EXPERT, wanted.level, insertion, None))
-                bar.update()
-        settings = wanted.model_dump(mode="json", exclude={"checkpoint", "output", "device"})
-        described = ("checkpoint", "step", "weights", "model_type")
-        settings |= {key: self.metadata[key] for key in described}
-        settings["instruction"] = self.instruction
-        return Rollouts(settings["checkpoint"], settings, tuple(episodes))
+            episodes += self._demonstrated(seeds, bar)
+        return episodes
+
+    def _demonstrated(self, seeds: Sequence[int], bar: "tqdm[Any]") -> Iterator[RolloutEpisode]:
+        """The demonstrator's episodes; none where the environment has no demonstrator."""
+        environment = self.environments[0]
+        for seed in seeds:
+            episode = _Episode(environment, seed)
+            while not episode.ended:
+                action = environment.expert_action()
+                if action is None:
+                    return
+                episode.step(action)
+            yield episode.record(EXPERT)
+            bar.update()
 
     def _begin(
-        self, seed: int, latency_s: float, ablation: RolloutAblation | None
-    ) -> _Robot[Memory]:
-        """A robot at the beginning of an episode, with its own generator of noise."""
-        environment = _begin_episode(self.metadata, self.wanted.level, seed)
+        self, seeds: Sequence[int], latency_s: float, ablation: RolloutAblation | None
+    ) -> list[_Robot[Memory]]:
+        """A robot at the beginning of each episode, with its own generator of noise."""
+        while len(self.environments) < len(seeds):
+            self.environments.append(self.make())
         reuse, uses_features = (self.metadata[k] for k in ("vlm_reuse_count", "uses_features"))
-        loop = ControlLoop(self._executor(), reuse, uses_features)
-        generator = torch.Generator().manual_seed(seed)
-        return _Robot(environment, loop, self.remember(seed), latency_s, ablation, generator)
+        return [
+            _Robot(
+                _Episode(environment, seed),
+                ControlLoop(self._executor(), reuse, uses_features),
+                self.remember(seed),
+                latency_s,
+                ablation,
+                torch.Generator().manual_seed(seed),
+            )
+            for environment, seed in zip(self.environments, seeds, strict=False)
+        ]
 
     def _drive(self, robots: Sequence[_Robot[Memory]], bar: "tqdm[Any]") -> None:
         """Run the episodes of these robots to their ends."""
         for robot in robots:
-            robot.sense(robot.environment.readings())
+            robot.sense()
         active = robots
         while active:
             if seeing := [robot for robot in active if self.looks(robot.loop)]:
@@ -400,10 +501,7 @@ class _LocalDriver(_Driver[RobotMemory]):
                 times = np.array([taken_s[view] for view in trained])
                 robot.see(SeenFeatures(row, np.ones(shape.slots, np.bool_), times))
             return
-        # Threads are enough: drawing and compressing, which take most of the time, run in parallel.
-        with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
-            shots = [*pool.map(lambda robot: robot.environment.frames(), robots)]
-        taken = [{view: views[view] for view in trained} for views in shots]
+        taken = [{view: views[view] for view in trained} for views in _shots(robots)]
         frames = [{view: frame for view, (_, frame) in views.items()} for views in taken]
         features, valid = self.features(frames, self.instruction)
         rows = zip(features.numpy(), valid.numpy(), strict=True)

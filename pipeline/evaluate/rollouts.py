@@ -1,7 +1,6 @@
-"""The results of rollouts: episodes of the simulated insertion, success rates and tables.
+"""The results of rollouts: episodes, success rates and tables.
 
-The environment (`pipeline.simulation.insertion`) defines success, its limits and the reasons of
-failure. Rates have Wilson intervals.
+The environment defines success and the reasons of failure. Rates have Wilson intervals.
 """
 
 from collections import Counter
@@ -10,12 +9,12 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import binomtest
 
 from pipeline.base.config import latencies_ms
 from pipeline.base.text import Table
 from pipeline.simulation.insertion import InsertionTrace
+from pipeline.simulation.interface import Shots
 
 POLICY: Final = "policy"
 EXPERT: Final = "expert"
@@ -34,28 +33,24 @@ def controller_name(controller: str) -> str:
 
 @dataclass(frozen=True)
 class RolloutEpisode:
-    """One episode, and how it ended.
-
-    `lateral_mm` is the distance sideways from the target where the tissue was punctured, else at
-    the end. `depth_mm` is the distance from the tip to the layer at the end, positive if the tip is
-    short of it. `overshoot_mm` is the greatest distance beyond the layer.
-    """
+    """One episode, and how it ended."""
 
     controller: str
     """`POLICY`, `EXPERT` (the demonstrator), or the ablation that the policy ran under."""
     seed: int
     level: str
+    """Of the phantom; of another environment its task."""
     success: bool
     reason: str
-    lateral_mm: float
-    depth_mm: float
-    overshoot_mm: float
-    max_force_n: float
+    figures: Mapping[str, float]
+    """What the environment says of the episode, by names with units."""
     time_s: float
     ticks: int
-    trace: InsertionTrace
-    frames: Callable[[float], Mapping[str, NDArray[np.uint8]]]
-    """The camera frames at a time in s: RGB (126, 224, 3) by view."""
+    frames: Callable[[Sequence[int]], list[Shots]]
+    """Plays the episode again, and gives the frames that were newest after so many actions."""
+    actions: int
+    trace: InsertionTrace | None = None
+    """The course of an insertion; None in other environments."""
 
 
 @dataclass(frozen=True)
@@ -87,23 +82,25 @@ class Rollouts:
     episodes: tuple[RolloutEpisode, ...]
 
     @property
-    def level(self) -> str:
-        """The level of all episodes."""
-        return self.episodes[0].level
+    def levels(self) -> tuple[str, ...]:
+        """The levels of the episodes, each once."""
+        return tuple(dict.fromkeys(episode.level for episode in self.episodes))
 
     @property
     def controllers(self) -> tuple[str, ...]:
         """The controllers of the episodes, the policy first."""
         return tuple(dict.fromkeys(episode.controller for episode in self.episodes))
 
-    def of(self, controller: str) -> tuple[RolloutEpisode, ...]:
-        """The episodes of one controller."""
-        return tuple(e for e in self.episodes if e.controller == controller)
+    def of(self, controller: str, level: str | None = None) -> tuple[RolloutEpisode, ...]:
+        """The episodes of one controller, at one level or, with None, at all."""
+        own = (e for e in self.episodes if e.controller == controller)
+        return tuple(e for e in own if level in (None, e.level))
 
-    def rates(self) -> dict[str, SuccessRate]:
-        """The success of each controller."""
+    def rates(self, level: str | None = None) -> dict[str, SuccessRate]:
+        """The success of each controller at a level, or at all."""
+        episodes = {name: self.of(name, level) for name in self.controllers}
         return {
-            name: SuccessRate.of([e.success for e in self.of(name)]) for name in self.controllers
+            name: SuccessRate.of([e.success for e in own]) for name, own in episodes.items() if own
         }
 
     def by_latency(self) -> dict[float, SuccessRate]:
@@ -113,36 +110,54 @@ class Rollouts:
         return {latency_ms: rates[names[latency_ms]] for latency_ms in sorted(names)}
 
     def summary(self) -> Table:
-        """A row for each controller: its success, and where and why its episodes ended."""
+        """A row for each controller and level: its success, and where and why its episodes ended.
+
+        Of the figures that the environment gives, the first is shown.
+        """
         rows: list[tuple[Any, ...]] = []
-        for name, rate in self.rates().items():
-            episodes = self.of(name)
-            lateral = float(np.median([episode.lateral_mm for episode in episodes]))
-            times = [episode.time_s for episode in episodes if episode.success]
-            failed = Counter(e.reason for e in episodes if not e.success).most_common()
-            reasons = ", ".join(f"{count} {reason}" for reason, count in failed)
-            rows.append(
-                (controller_name(name), str(rate), len(episodes), lateral,
-                 float(np.median(times)) if times else None, reasons)
-            )  # fmt: skip
-        heads = ("controller", "success (95 % interval)", "episodes", "median lateral miss [mm]",
-                 "median time to success [s]", "failed by")  # fmt: skip
-        return Table(heads, rows, f"Success at level {self.level}")
+        figure = next(iter(self.episodes[0].figures), None)
+        several = len(self.levels) > 1
+        for level in self.levels:
+            for name, rate in self.rates(level).items():
+                episodes = self.of(name, level)
+                times = [episode.time_s for episode in episodes if episode.success]
+                failed = Counter(e.reason for e in episodes if not e.success).most_common()
+                reasons = ", ".join(f"{count} {reason}" for reason, count in failed)
+                row = [controller_name(name), str(rate), len(episodes)]
+                row += [level] if several else []
+                row += [_median([e.figures[figure] for e in episodes])] if figure else []
+                rows.append((*row, _median(times), reasons))
+        heads = ["controller", "success (95 % interval)", "episodes"]
+        heads += ["level"] if several else []
+        heads += [f"median {_spelled(figure)}"] if figure else []
+        title = "Success" if several else f"Success at level {self.levels[0]}"
+        return Table((*heads, "median time to success [s]", "failed by"), rows, title)
 
     def document(self) -> dict[str, Any]:
         """The content of metrics.json."""
         success = {name: vars(rate) for name, rate in self.rates().items()}
+        levels = {
+            level: {name: vars(rate) for name, rate in self.rates(level).items()}
+            for level in self.levels
+        }
         late = {f"{latency_ms:g}": vars(rate) for latency_ms, rate in self.by_latency().items()}
-        return {"success": success, "levels": {self.level: success}, "latency_ms": late}
+        return {"success": success, "levels": levels, "latency_ms": late}
 
     def table(self, policy: bool) -> Table:
         """A row for each episode: of the policy, or of the others with their controller."""
-        heads = _COLUMNS if policy else ("controller", *_COLUMNS)
+        figures = tuple(dict.fromkeys(key for e in self.episodes for key in e.figures))
+        own = ("seed", "level", "success", "reason", *figures, "time_s", "ticks")
+        heads = own if policy else ("controller", *own)
         episodes = [e for e in self.episodes if (e.controller == POLICY) == policy]
-        return Table(heads, [tuple(getattr(e, name) for name in heads) for e in episodes])
+        rows = [tuple({**vars(e), **e.figures}.get(name) for name in heads) for e in episodes]
+        return Table(heads, rows)
 
 
-_COLUMNS: Final = (
-    "seed", "level", "success", "reason", "lateral_mm", "depth_mm", "overshoot_mm", "max_force_n",
-    "time_s", "ticks",
-)  # fmt: skip
+def _median(values: Sequence[float]) -> float | None:
+    return float(np.median(values)) if values else None
+
+
+def _spelled(figure: str) -> str:
+    """`lateral_mm` gives `lateral [mm]`."""
+    name, _, unit = figure.rpartition("_")
+    return f"{name.replace('_', ' ')} [{unit}]"

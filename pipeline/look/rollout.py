@@ -20,9 +20,10 @@ from pipeline.simulation.insertion import (
     MISS_MM,
     OVERSHOOT_MM,
     TICK_S,
+    InsertionTrace,
 )
 
-_SUCCESS = (
+_INSERTION = (
     f"An episode succeeds where the needle punctures within {MISS_MM:.1f} mm of the target, rests "
     f"within {AT_LAYER_MM:g} mm of the layer for {HOLD_TICKS} ticks, never goes more than "
     f"{OVERSHOOT_MM:g} mm beyond it, never meets more than {FORCE_LIMIT_N:g} N, and all of this "
@@ -30,6 +31,7 @@ _SUCCESS = (
     "`depth`, which begins above the target, so that the sensor suffices, `full`, which begins "
     "anywhere, and `moved`, in which target and tissue are also pushed on the way."
 )
+_TASK = "The environment itself says whether an episode succeeds, and with which reason it ends."
 _CONTROLLERS = (
     "The demonstrator is the rule that made the training data, and sees what the simulation hides. "
     "With a stream off, the same policy sees its training mean; with one frozen, its first reading "
@@ -57,18 +59,24 @@ def rollout_report(rollouts: Rollouts) -> Report:
     """
     rates, episodes = rollouts.rates(), rollouts.of("policy")
     shares = "; ".join(f"{controller_name(name)} {rate}" for name, rate in rates.items())
+    inserts = all(episode.trace for episode in episodes)
+    where = "needle insertion" if inserts else "environment"
+    levels = f"level {rollouts.levels[0]}" if inserts else ", ".join(rollouts.levels)
     return Report(
         title=f"Rollouts of {rollouts.checkpoint}",
         summary=(
-            "The policy acts in the simulated needle insertion and sees what its actions lead to. "
-            f"Episodes that succeed at level {rollouts.level}: {shares}."
+            f"The policy acts in the simulated {where} and sees what its actions lead to. "
+            f"Episodes that succeed at {levels}: {shares}."
         ),
         tiles=[("success of the policy", str(rates["policy"]))],
         sections=(
-            Section("Success", [Text(_SUCCESS), Text(_CONTROLLERS), rollouts.summary()]),
+            Section(
+                "Success",
+                [Text(_INSERTION if inserts else _TASK), Text(_CONTROLLERS), rollouts.summary()],
+            ),
             *_lateness(rollouts),
-            Section("Where the needle went", _paths_and_courses(rollouts)),
-            Section("Episodes closely", (), tuple(_filmstrips(episodes))),
+            *([Section("Where the needle went", _paths_and_courses(rollouts))] if inserts else []),
+            Section("Episodes closely", (), tuple(_filmstrips(rollouts))),
             Section("What was run", [Outline("Settings of the rollout", rollouts.settings)]),
         ),
     )
@@ -89,7 +97,7 @@ def draw_latency(rates: Mapping[float, SuccessRate]) -> Figure:
     centre, low, high = 100 * np.array([(r.rate, r.low, r.high) for r in rates.values()]).T
     bars = np.stack([centre - low, high - centre])
     axis.errorbar([*rates], centre, np.maximum(bars, 0), fmt="o-", capsize=3, color=PALETTE[0])
-    axis.set(xlabel="a pass of the model takes [ms]", ylabel="inserted [%]", ylim=(-2, 102))
+    axis.set(xlabel="a pass of the model takes [ms]", ylabel="success [%]", ylim=(-2, 102))
     return figure
 
 
@@ -97,13 +105,21 @@ def worst_and_median(episodes: Sequence[RolloutEpisode]) -> dict[str, RolloutEpi
     """The worst episode, and the median, halfway to the best; a single one is only the worst.
 
     Failures are worse than successes. Among equals, the greater the sum of the tip's distances from
-    the target and from the layer (mm), the worse.
+    the target and from the layer (mm), the worse; without a needle, the longer the worse.
     """
-    ordered = sorted(
-        episodes, key=lambda episode: (episode.success, -episode.lateral_mm - abs(episode.depth_mm))
-    )
+    ordered = sorted(episodes, key=lambda episode: (episode.success, -_badness(episode)))
     both = {"worst": ordered[0], "median": ordered[len(ordered) // 2]}
     return both if both["median"] is not ordered[0] else {"worst": ordered[0]}
+
+
+def _badness(episode: RolloutEpisode) -> float:
+    missed = episode.figures
+    return missed["lateral_mm"] + abs(missed["depth_mm"]) if episode.trace else episode.time_s
+
+
+def _trace(episode: RolloutEpisode) -> InsertionTrace:
+    assert episode.trace is not None, "the needle's pictures are drawn of insertions alone"
+    return episode.trace
 
 
 def _paths_and_courses(rollouts: Rollouts) -> list[Block]:
@@ -128,7 +144,7 @@ def _paths_and_courses(rollouts: Rollouts) -> list[Block]:
 def draw_paths(rollouts: Rollouts) -> Figure:
     """The tip's paths of policy and demonstrator, seen from above; the lower row is close up."""
     shown = [name for name in ("policy", "expert") if rollouts.of(name)]
-    begins = [episode.trace.offset_mm[:1] for name in shown for episode in rollouts.of(name)]
+    begins = [_trace(episode).offset_mm[:1] for name in shown for episode in rollouts.of(name)]
     far = max(_NEAR_MM, _REACH * float(np.abs(np.concatenate(begins)).max()))
     size = _WIDTH * max(len(shown), 1.4) / 2, _WIDTH + 0.9
     figure, axes = panels(*size, 2, len(shown), squeeze=False)
@@ -144,7 +160,7 @@ def draw_paths(rollouts: Rollouts) -> Figure:
 def _draw_all(axis: Axes, episodes: Sequence[RolloutEpisode], reach_mm: float) -> None:
     """Draw the path of each episode from where it last comes within reach."""
     for episode in episodes:
-        offset_mm = episode.trace.offset_mm
+        offset_mm = _trace(episode).offset_mm
         (outside,) = np.nonzero(np.abs(offset_mm).max(axis=1) > reach_mm)
         style: dict[str, Any] = {"lw": 0.8, "alpha": 0.45, "rasterized": len(episodes) > _MANY}
         shown = offset_mm[outside[-1] if len(outside) else 0 :]
@@ -153,7 +169,7 @@ def _draw_all(axis: Axes, episodes: Sequence[RolloutEpisode], reach_mm: float) -
     label = f"{MISS_MM:g} mm from the target"
     axis.plot(around.real, around.imag, color=INK, lw=1.6, zorder=6, label=label)
     for outcome, (label, colour, marker) in _OUTCOMES.items():
-        ends = [episode.trace.lateral_mm for episode in episodes if episode.success == outcome]
+        ends = [_trace(episode).lateral_mm for episode in episodes if episode.success == outcome]
         style = {"s": 34, "color": colour, "edgecolors": "white", "lw": 0.6, "zorder": 7}
         axis.scatter(*np.reshape(ends, (-1, 2)).T, marker=marker, label=label, **style)
     axis.set(xlim=(-reach_mm, reach_mm), ylim=(-reach_mm, reach_mm), aspect="equal")
@@ -183,7 +199,7 @@ def draw_courses(
 
 def _draw_course(axes: Sequence[Axes], episode: RolloutEpisode, **style: Any) -> None:
     """Draw, from top to bottom: distance sideways, height, distance to the layer, force."""
-    trace = episode.trace
+    trace = _trace(episode)
     shown = (np.hypot(*trace.offset_mm.T), trace.height_mm, trace.layer_mm, trace.force_n)
     for axis, values in zip(axes, shown, strict=True):
         axis.plot(trace.time_s, values, **style)
@@ -204,31 +220,40 @@ def _mark_limits(axes: Sequence[Axes]) -> None:
     force.set(title=f"force [N]; dashed: {FORCE_LIMIT_N:g}", xlabel="time [s]", ylim=(0, None))
 
 
-def _filmstrips(episodes: Sequence[RolloutEpisode]) -> Iterator[Section]:
-    caption = (
-        "What the cameras saw at moments from the beginning to the end. While the needle presses "
-        "and has not punctured, the layer gives way with it."
-    )
-    for kind, episode in worst_and_median(episodes).items():
-        side = "short of" if episode.depth_mm > 0 else "beyond"
-        words = (
-            f"{sentence(episode.reason)} {episode.lateral_mm:.2f} mm sideways from the target at "
-            f"the puncture, {abs(episode.depth_mm):.2f} mm {side} the layer in the end, at most "
-            f"{episode.overshoot_mm:.2f} mm beyond it and {episode.max_force_n:.2f} N, "
-            f"{episode.time_s:.1f} s."
+def _filmstrips(rollouts: Rollouts) -> Iterator[Section]:
+    for level in rollouts.levels:
+        for kind, episode in worst_and_median(rollouts.of("policy", level)).items():
+            called = f"level {level}" if episode.trace else level
+            title = f"{kind.capitalize()}: seed {episode.seed}, {called}"
+            caption = "What the cameras saw at moments from the beginning to the end."
+            if episode.trace:
+                caption += " While the needle presses and has not punctured, the layer gives way."
+            draw = partial(draw_filmstrip, episode, f"{title}, {episode.reason}")
+            name = f"filmstrip_{kind}" if len(rollouts.levels) == 1 else f"{level}_{kind}"
+            yield Section(title, [Text(_ending(episode)), Picture(name, caption, draw)])
+
+
+def _ending(episode: RolloutEpisode) -> str:
+    """How the episode ended, in a sentence."""
+    words = sentence(episode.reason)
+    if episode.trace:
+        depth_mm = episode.figures["depth_mm"]
+        side = "short of" if depth_mm > 0 else "beyond"
+        words += (
+            f" {episode.figures['lateral_mm']:.2f} mm sideways from the target at the puncture, "
+            f"{abs(depth_mm):.2f} mm {side} the layer in the end, at most "
+            f"{episode.figures['overshoot_mm']:.2f} mm beyond it and "
+            f"{episode.figures['max_force_n']:.2f} N, {episode.time_s:.1f} s."
         )
-        title = f"{kind.capitalize()}: seed {episode.seed}, level {episode.level}"
-        draw = partial(draw_filmstrip, episode, f"{title}, {episode.reason}")
-        yield Section(title, [Text(words), Picture(f"filmstrip_{kind}", caption, draw)])
+    return words if episode.trace else f"{words} {episode.time_s:.1f} s."
 
 
 def draw_filmstrip(episode: RolloutEpisode, title: str) -> Figure:
     """The frames of every view at moments from beginning to end."""
-    trace = episode.trace
-    ticks = np.unique(np.linspace(0, len(trace.time_s) - 1, _MOMENTS).round().astype(int))
-    moments = trace.time_s[ticks].tolist()
-    shown = [episode.frames(moment) for moment in moments]
-    frames = {view: [images[view] for images in shown] for view in shown[0]}
+    after = np.unique(np.linspace(0, episode.actions, _MOMENTS).round().astype(int)).tolist()
+    shots = episode.frames(after)
+    frames = {view: [shown[view][1] for shown in shots] for view in shots[0]}
+    moments = [max(time_s for time_s, _ in shown.values()) for shown in shots]
     heights = [10 / _MOMENTS * image.shape[0] / image.shape[1] for image, *_ in frames.values()]
     figure = canvas(10.4, sum(heights) + 0.8)
     grid = figure.add_gridspec(len(frames), _MOMENTS, height_ratios=heights)

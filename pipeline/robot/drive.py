@@ -1,13 +1,11 @@
 """Drive the robot that params name with a policy, in this process or behind a server."""
 
-import inspect
 import os
 import sys
 from collections.abc import Callable, Generator, Mapping, Sequence
 from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import replace
 from importlib import import_module
-from pathlib import Path
 from pkgutil import iter_modules
 from typing import Any
 
@@ -17,6 +15,7 @@ from tqdm import tqdm
 from pipeline.base.border import problems
 from pipeline.base.config import DriveParams, Params
 from pipeline.base.errors import ConfigError, RobotStopped
+from pipeline.base.named import make_named
 from pipeline.robot.client import TOKEN_VARIABLE, PolicyClient, refuse_other_robot
 from pipeline.robot.lerobot_arm import LeRobotArm
 from pipeline.robot.limits import Limits
@@ -71,23 +70,7 @@ def make_robot(name: str, arguments: Mapping[str, Any]) -> Any:
         raise ConfigError(f"drive.robot: expected module:Class or lerobot:TYPE, found {name!r}")
     if module == _LEROBOT:
         return _lerobot_robot(made, arguments)
-    if "" not in sys.path:
-        sys.path.insert(0, "")  # the current folder, as with `python -m`
-    try:
-        home = import_module(module)
-    except ImportError as error:
-        raise ConfigError(
-            f"drive.robot: {name}: {error}. Name a class of a module that python finds from "
-            f"{Path.cwd()}"
-        ) from error
-    made_by = getattr(home, made, None)
-    if made_by is None:
-        raise ConfigError(f"drive.robot: {name}: expected {made} in {home.__file__}, found none")
-    try:
-        bound = inspect.signature(made_by).bind(**arguments)
-    except TypeError as error:
-        raise ConfigError(f"drive.robot_args: {name}: {error}") from None
-    return made_by(*bound.args, **bound.kwargs)
+    return make_named("drive.robot", name, arguments)
 
 
 def _lerobot_robot(kind: str, config: Mapping[str, Any]) -> Any:

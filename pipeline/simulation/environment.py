@@ -17,11 +17,12 @@ import numpy as np
 from gymnasium.spaces import Box, Dict
 from numpy.typing import NDArray
 
-from pipeline.base.config import Level
+from pipeline.base.config import PHANTOM, Level
 from pipeline.data.insertion import SENSOR, STATE
-from pipeline.data.timeline import ActionRotation
+from pipeline.data.timeline import ActionRotation, pose_channels
 from pipeline.simulation.insertion import (
     INSERTED,
+    INSTRUCTION,
     MAX_TICKS,
     READINGS_PER_TICK,
     STATE_HZ,
@@ -30,6 +31,7 @@ from pipeline.simulation.insertion import (
     TIME_IS_UP,
     NeedleInsertion,
 )
+from pipeline.simulation.interface import EnvironmentRobot, Readings, RobotEnvironment, Shots
 from pipeline.simulation.needle_sensor import READING_HZ
 from pipeline.simulation.recorder import CAMERA_HZ, CAMERA_JITTER_S, LOST_FRAMES
 from pipeline.simulation.rendering import HEIGHT, VIEWS, WIDTH, photograph, through_jpeg
@@ -40,12 +42,8 @@ _STATES_PER_TICK: Final = STATE_HZ // TICK_HZ
 _FRAME_S: Final = 0.9 / CAMERA_HZ
 """Least time between two frames of a `SimulatedRobot`, however fast it is: each takes 6 ms."""
 
-Readings = dict[str, NDArray[Any]]
-Shots = dict[str, tuple[float, NDArray[np.uint8]]]
-"""By view: the capture time of its newest frame in s, and the frame (height, width, 3), RGB."""
 
-
-class InsertionEnvironment(gymnasium.Env[Any, NDArray[np.floating[Any]]]):
+class InsertionEnvironment(RobotEnvironment):
     """One needle insertion for each seed; an action (7,) is added to the commanded setpoint.
 
     It is dx dy dz in mm in the base frame, rotation in degrees in the convention of
@@ -57,6 +55,7 @@ class InsertionEnvironment(gymnasium.Env[Any, NDArray[np.floating[Any]]]):
     """
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": TICK_HZ}  # noqa: RUF012
+    draws_in_threads = True
 
     def __init__(
         self,
@@ -75,6 +74,17 @@ class InsertionEnvironment(gymnasium.Env[Any, NDArray[np.floating[Any]]]):
         self.render_mode = render_mode
         self.level: Level = level
         self.insertion = NeedleInsertion(action_rotation)
+        self.robot = EnvironmentRobot(
+            name=PHANTOM,
+            level=level,
+            instruction=INSTRUCTION,
+            hz=TICK_HZ,
+            action=pose_channels(action_rotation),
+            action_kind="delta",
+            views=VIEWS,
+            state=STATE,
+            sensor=SENSOR,
+        )
         self._cameras = cameras
         self.action_space = Box(-_LARGEST_ACTION, _LARGEST_ACTION, (7,), np.float32)
         spaces: dict[str, Any] = {
@@ -150,6 +160,25 @@ class InsertionEnvironment(gymnasium.Env[Any, NDArray[np.floating[Any]]]):
         now = self.insertion.time_s + 1e-9
         newest = [shots[shots <= now].max() for shots in self._shots]
         return dict(zip(VIEWS, map(float, newest), strict=True))
+
+    def expert_action(self) -> NDArray[np.float64]:
+        """The demonstrator's next action (7,)."""
+        return self.insertion.expert_action()
+
+    def figures(self) -> Mapping[str, float]:
+        """Where the needle went.
+
+        `lateral_mm` is the distance sideways from the target where the tissue was punctured, else
+        at the end. `depth_mm` is the distance from the tip to the layer at the end, positive if the
+        tip is short of it. `overshoot_mm` is the greatest distance beyond the layer.
+        """
+        progress, trace = self.insertion.progress, self.insertion.trace()
+        return {
+            "lateral_mm": float(np.hypot(*trace.lateral_mm)),
+            "depth_mm": float(trace.layer_mm[-1]),
+            "overshoot_mm": progress.overshoot_mm,
+            "max_force_n": progress.max_force_n,
+        }
 
     def _info(self) -> dict[str, Any]:
         outcome = self.insertion.outcome

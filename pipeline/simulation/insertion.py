@@ -124,6 +124,7 @@ class Progress:
         return TIME_IS_UP if self.puncture_mm is not None else f"{TIME_IS_UP} before a puncture"
 
 
+INSTRUCTION: Final = "Insert the needle at the red point"
 INSERTED: Final = "inserted"
 TIME_IS_UP: Final = "time is up"
 

@@ -21,12 +21,11 @@ from pipeline.data.lerobot import STATE as STATE_KEY
 from pipeline.data.lerobot_writer import FilmedRows, write_sidecar, write_v21
 from pipeline.data.pickled import ACTION
 from pipeline.simulation.arm import euler_actions
-from pipeline.simulation.insertion import STATE_HZ, TICK_HZ, TICK_S
+from pipeline.simulation.insertion import INSTRUCTION, STATE_HZ, TICK_HZ, TICK_S
 from pipeline.simulation.needle_sensor import READING_HZ
 from pipeline.simulation.recorder import SimulatedEpisode
 from pipeline.simulation.rendering import JPEG_QUALITY, VIEWS
 
-INSTRUCTION: Final = "Insert the needle at the red point"
 ABUTTING, OVERLAPPING = (65, 65), (650, 130)
 """Readings in a window of the new format, and readings from one window's start to the next."""
 

@@ -10,7 +10,7 @@ import warnings
 from collections.abc import Mapping
 from ctypes.util import find_library
 from functools import cache
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 import gymnasium
 import numpy as np
@@ -18,8 +18,8 @@ from gymnasium.spaces import Box, Dict
 from numpy.typing import NDArray
 
 from pipeline.base.errors import ConfigError
-from pipeline.data.recording import ActionKind, Channels
-from pipeline.simulation.environment import Readings, Shots
+from pipeline.data.recording import Channels
+from pipeline.simulation.interface import EnvironmentRobot, Readings, RobotEnvironment, Shots
 
 HZ: Final = 80
 MAX_TICKS: Final = 500
@@ -46,18 +46,6 @@ _BOUND: Final = np.array([_STEP_MM, _STEP_MM, _STEP_MM, 1.0])
 _LARGEST: Final = 1e4
 
 
-class MetaWorldRobot(NamedTuple):
-    """What a policy must fit to drive the environment; it has no sensor."""
-
-    name: str
-    instruction: str
-    hz: float
-    action: Channels
-    action_kind: ActionKind
-    state: Channels
-    views: tuple[str, ...]
-
-
 def full_name(task: str) -> str:
     """The name of a task with its version: `assembly` gives `assembly-v3`."""
     return task if task.endswith("-v3") else f"{task}-v3"
@@ -70,7 +58,7 @@ def instruction_of(task: str) -> str:
     return INSTRUCTIONS.get(name, f"{words.capitalize()}.")
 
 
-class MetaWorldEnvironment(gymnasium.Env[Any, NDArray[np.floating[Any]]]):
+class MetaWorldEnvironment(RobotEnvironment):
     """One episode of a task for each seed, which draws the places of object and goal.
 
     An action (4,) is dx dy dz in mm, added to the hand's setpoint, and the force of the fingers;
@@ -96,8 +84,15 @@ class MetaWorldEnvironment(gymnasium.Env[Any, NDArray[np.floating[Any]]]):
         """
         name = full_name(task)
         self.render_mode = render_mode
-        self.robot = MetaWorldRobot(
-            f"metaworld:{name}", instruction_of(name), HZ, ACTION, "delta", STATE, (VIEW,)
+        self.robot = EnvironmentRobot(
+            name=f"metaworld:{name}",
+            level=name,
+            instruction=instruction_of(name),
+            hz=HZ,
+            action=ACTION,
+            action_kind="delta",
+            views=(VIEW,),
+            state=STATE,
         )
         self._simulator, self._expert = _simulator(name), _expert(name)
         self._task, self._image, self._shadows = name, image, shadows
@@ -143,7 +138,7 @@ class MetaWorldEnvironment(gymnasium.Env[Any, NDArray[np.floating[Any]]]):
         self._simulator.seed(drawn)
         self._seen, _ = self._simulator.reset()
         self.ticks, self.outcome = 0, None
-        return self.readings(), {"success": False}
+        return self._readings(), {"success": False}
 
     def step(
         self, action: NDArray[np.floating[Any]]
@@ -167,10 +162,9 @@ class MetaWorldEnvironment(gymnasium.Env[Any, NDArray[np.floating[Any]]]):
         info: dict[str, Any] = {"success": self.success}
         info |= {"reason": self.outcome} if self.finished else {}
         late = self.outcome == TIME_IS_UP
-        return self.readings(), float(self.success), self.success, late, info
+        return self._readings(), float(self.success), self.success, late, info
 
-    def readings(self) -> Readings:
-        """The newest observation."""
+    def _readings(self) -> Readings:
         assert self._seen is not None
         time = np.array([self.time_s])
         hand = np.append(self._simulator.get_endeff_pos() * 1000, self._seen[3])
@@ -187,6 +181,10 @@ class MetaWorldEnvironment(gymnasium.Env[Any, NDArray[np.floating[Any]]]):
     def frames(self) -> Shots:
         """The frame of now, drawn when this is called."""
         return {VIEW: (self.time_s, self.render())}
+
+    def frame_times(self) -> Mapping[str, float]:
+        """Now: nothing is drawn."""
+        return {VIEW: self.time_s}
 
     def render(self) -> NDArray[np.uint8]:  # pyright: ignore[reportIncompatibleMethodOverride]
         """The frame of now."""

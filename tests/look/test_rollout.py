@@ -1,6 +1,6 @@
 """The page of rollouts says how they ended, for any number of episodes, and a browser shows it."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -29,9 +29,13 @@ VIEWS = ("View1", "View2")
 ENDINGS = ("time is up", "punctured beside the target", "safe stop: the sensor stalled")
 
 
-def frames(time_s: float) -> dict[str, np.ndarray]:
-    shade = np.uint8(min(255, 20 * time_s))
-    return {view: np.full((126, 224, 3), shade, np.uint8) for view in VIEWS}
+def frames(after: Sequence[int]) -> list[dict[str, tuple[float, np.ndarray]]]:
+    """Brighter with every action."""
+    shades = [np.full((126, 224, 3), min(255, 2 * played), np.uint8) for played in after]
+    return [
+        dict.fromkeys(VIEWS, (0.1 * played, shade))
+        for played, shade in zip(after, shades, strict=True)
+    ]
 
 
 def rollout_episode(seed: int = 0, ticks: int = 60, **changed: Any) -> RolloutEpisode:
@@ -50,11 +54,12 @@ def rollout_episode(seed: int = 0, ticks: int = 60, **changed: Any) -> RolloutEp
     )
     given = {
         "controller": "policy", "seed": seed, "level": "full", "success": True,
-        "reason": "inserted", "lateral_mm": miss, "depth_mm": 0.05, "overshoot_mm": 0.1,
-        "max_force_n": 0.6, "time_s": 0.1 * ticks, "ticks": ticks, "trace": trace,
-        "frames": frames,
+        "reason": "inserted", "time_s": 0.1 * ticks, "ticks": ticks, "trace": trace,
+        "frames": frames, "actions": ticks - 1,
     }  # fmt: skip
-    return RolloutEpisode(**given | changed)
+    figures = {"lateral_mm": miss, "depth_mm": 0.05, "overshoot_mm": 0.1, "max_force_n": 0.6}
+    figures = {name: changed.pop(name, value) for name, value in figures.items()}
+    return RolloutEpisode(**given | changed, figures=figures)
 
 
 def failed(seed: int = 0, **changed: Any) -> RolloutEpisode:
@@ -167,14 +172,37 @@ def test_paths_end_by_success_and_begin_near_when_close_up(rollouts: Rollouts) -
 
 
 def test_a_filmstrip_asks_for_frames_at_its_moments() -> None:
-    asked = list[float]()
+    asked = list[int]()
 
-    def frames(time_s: float) -> dict[str, np.ndarray]:
-        asked.append(time_s)
-        return {"View1": np.zeros((126, 224, 3), np.uint8)}
+    def watched(after: Sequence[int]) -> list[dict[str, tuple[float, np.ndarray]]]:
+        asked.extend(after)
+        return frames(after)
 
-    episode = rollout_episode(ticks=60, frames=frames)
-    figure = draw_filmstrip(episode, "Worst")
-    assert len(asked) == 8
-    assert (asked[0], asked[-1]) == (episode.trace.time_s[0], episode.trace.time_s[-1])
-    assert [axis.get_title() for axis in figure.axes[:8]] == [f"{at:.1f} s" for at in asked]
+    figure = draw_filmstrip(rollout_episode(ticks=60, frames=watched), "Worst")
+    assert (len(asked), asked[0], asked[-1]) == (8, 0, 59)
+    titles = [axis.get_title() for axis in figure.axes[:8]]
+    assert titles == [f"{0.1 * played:.1f} s" for played in asked]
+
+
+def test_episodes_of_other_environments_have_no_needle(
+    tmp_path: Path, assert_page_is_sound: Sound
+) -> None:
+    """Several tasks in one page, without figures; the longer of two failures is the worse."""
+    plain: dict[str, Any] = {"trace": None, "reason": "the time is up", "success": False}
+    made = [
+        replace(rollout_episode(seed, level=task, **plain, time_s=seed), figures={})
+        for task in ("hammer-v3", "assembly-v3")
+        for seed in (1, 2, 3)
+    ]
+    made[0] = replace(made[0], success=True, reason="succeeded")
+    report = rollout_report(rollouts_of(*made))
+    names = [
+        f"{task}_{kind}" for task in ("hammer-v3", "assembly-v3") for kind in ("worst", "median")
+    ]
+    assert drawn(report) == set(names)
+    titles = [section.title for section in report.sections[1].parts]
+    assert titles[0] == "Worst: seed 3, hammer-v3" and titles[1] == "Median: seed 2, hammer-v3"
+    (table,) = report.blocks(Table)
+    assert [row[3] for row in table.rows] == ["hammer-v3", "assembly-v3"]
+    write_report(tmp_path, report)
+    assert_page_is_sound(tmp_path / PAGE)

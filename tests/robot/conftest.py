@@ -23,7 +23,8 @@ from pipeline.robot import process
 from pipeline.robot.process import PolicyThread
 from pipeline.robot.server import PolicyServer, listen
 from pipeline.robot.session import ServedPolicy
-from pipeline.simulation.insertion_formats import INSTRUCTION, write_raw
+from pipeline.simulation.insertion import INSTRUCTION
+from pipeline.simulation.insertion_formats import write_raw
 from pipeline.simulation.recorder import simulate_episode
 from pipeline.simulation.rendering import VIEWS
 from pipeline.store import FeatureStore

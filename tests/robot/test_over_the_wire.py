@@ -19,7 +19,7 @@ from pipeline.robot.loop import StopKind
 from pipeline.robot.realtime import RunSettings, run_robot
 from pipeline.robot.recorder import RunRecorder
 from pipeline.simulation.environment import SimulatedRobot
-from pipeline.simulation.insertion_formats import INSTRUCTION
+from pipeline.simulation.insertion import INSTRUCTION
 
 Served = Callable[..., Any]
 

@@ -21,7 +21,7 @@ from pipeline.look.robot_run import compare_keys
 from pipeline.robot import recorder as recorder_module
 from pipeline.robot.recorder import RunRecorder, encode_png, recover
 from pipeline.simulation.environment import InsertionEnvironment
-from pipeline.simulation.insertion_formats import INSTRUCTION
+from pipeline.simulation.insertion import INSTRUCTION
 from pipeline.simulation.rendering import VIEWS
 from pipeline.store import FeatureStore
 from pipeline.vlm.feature_spec import feature_spec

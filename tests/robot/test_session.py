@@ -16,7 +16,7 @@ from pipeline.policy.observation import moving_channels
 from pipeline.robot.loop import Executor
 from pipeline.robot.session import Session
 from pipeline.simulation.environment import InsertionEnvironment
-from pipeline.simulation.insertion_formats import INSTRUCTION
+from pipeline.simulation.insertion import INSTRUCTION
 from pipeline.simulation.rendering import VIEWS
 
 Observe = Callable[..., dict[str, Any]]

@@ -15,8 +15,15 @@ from gymnasium.utils.env_checker import check_env
 from pipeline.simulation.environment import InsertionEnvironment, SimulatedRobot
 from pipeline.simulation.insertion import INSERTED, MAX_TICKS, TICK_S, TIME_IS_UP
 from pipeline.simulation.rendering import VIEWS, photograph, render
+from tests.simulation.environment_contract import EnvironmentContract
 
 STILL = np.zeros(7, np.float32)
+
+
+class TestPhantom(EnvironmentContract):
+    @pytest.fixture
+    def environment(self) -> InsertionEnvironment:
+        return InsertionEnvironment(cameras=False)
 
 
 @pytest.mark.parametrize("cameras", [True, False])

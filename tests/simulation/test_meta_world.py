@@ -17,10 +17,19 @@ from pipeline.simulation.meta_world import (
     choose_drawing,
     instruction_of,
 )
+from tests.simulation.environment_contract import EnvironmentContract
 
 needs_meta_world = pytest.mark.skipif(
     find_spec("metaworld") is None, reason="needs the extra `metaworld`"
 )
+
+
+@needs_meta_world
+@pytest.mark.extra
+class TestMetaWorld(EnvironmentContract):
+    @pytest.fixture
+    def environment(self) -> MetaWorldEnvironment:
+        return MetaWorldEnvironment("hammer", image=64)
 
 
 def play(environment: MetaWorldEnvironment, seed: int, ticks: int = MAX_TICKS) -> np.ndarray:

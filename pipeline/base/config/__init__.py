@@ -11,6 +11,7 @@ keys and reads files.
 
 from pipeline.base.config.params import Params, described_keys, load_params, load_section, setting
 from pipeline.base.config.policy_use import (
+    PHANTOM,
     Chunking,
     DriveParams,
     EvaluateParams,
@@ -21,6 +22,7 @@ from pipeline.base.config.policy_use import (
     RolloutAblation,
     RolloutParams,
     ServeParams,
+    environments,
     latencies_ms,
 )
 from pipeline.base.config.stage_one import (

@@ -2,9 +2,9 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Final, Literal
 
-from pydantic import Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
 from pipeline.base.config.section import Output, Place, Section, Seed
 
@@ -14,6 +14,19 @@ RolloutAblation = Literal[
     "sensor off", "features off", "state off", "sensor frozen", "features frozen", "state frozen"
 ]
 ExportFormat = Literal["onnx", "torch"]
+PHANTOM: Final = "phantom"
+
+
+def _known_form(name: str) -> str:
+    """A name that may be an environment's; whether there is such a one shows when it is opened."""
+    kind, _, rest = name.partition(":")
+    if name != PHANTOM and not (kind and rest):
+        raise ValueError(f"expected {PHANTOM}, metaworld:TASK or module:name, found {name!r}")
+    return name
+
+
+Environment = Annotated[str, AfterValidator(_known_form)]
+Environments = Annotated[tuple[Environment, ...], Field(min_length=1)]
 Latency = Annotated[float, Field(ge=0, le=60_000)]
 
 
@@ -45,22 +58,31 @@ class EvaluateParams(Section):
     checksum; false skips this, where it takes too long."""
 
 
+def environments(named: str | Sequence[str] | None) -> tuple[str, ...]:
+    """Each environment of `rollout.environment` once, in the given order."""
+    return tuple(dict.fromkeys((named,) if isinstance(named, str) else named or ()))
+
+
 def latencies_ms(latency: float | Sequence[float]) -> tuple[float, ...]:
     """Each latency of `rollout.latency_ms` once, in the given order."""
     return tuple(dict.fromkeys(latency if isinstance(latency, Sequence) else (latency,)))
 
 
 class RolloutParams(Section):
-    """How a policy runs in closed loop in the simulation, and where the report is written."""
+    """How a policy runs in closed loop in a simulation, and where the report is written."""
 
     checkpoint: Place | None = None
     """A training run's folder, or one checkpoint in it; `train_head.output` where null."""
-    environment: Literal["phantom"] | None = "phantom"
-    """The simulated needle insertion of the demo. null runs no rollout, for recordings of another
-    robot; the stage then only says so."""
+    environment: Environment | Annotated[tuple[Environment, ...], Field(min_length=1)] | None = (
+        PHANTOM
+    )
+    """phantom: the simulated needle insertion of the demo. metaworld:TASK: a task of Meta-World,
+    such as metaworld:assembly-v3. module:name: what this class or function of yours makes
+    (docs/recipes/environment.md). A list: one after another. null runs no rollout, for recordings
+    of another robot; the stage then only says so."""
     level: Level = "full"
-    """depth: the needle begins above the target, so that the sensor is enough. full: it begins
-    anywhere. moved: like full, and target and tissue are pushed during the insertion."""
+    """Of the phantom alone. depth: the needle begins above the target, and the sensor is enough.
+    full: it begins anywhere. moved: as full, and target and tissue are pushed meanwhile."""
     episodes: int = Field(default=50, ge=1, le=1_000_000)
     """Episodes per controller."""
     seed: int = Field(default=1_000_000, ge=0, lt=2**53)
