@@ -1,16 +1,25 @@
 """Meta-World by the protocol of CortexBench, with this project's pipeline.
 
 python -m experiments.metaworld record [--tasks …] [--episodes N] [--seed N] --out FOLDER
+python -m experiments.metaworld run [VARIANT …] [--seeds N] [--checkpoint FOLDER] --out FOLDER
+python -m experiments.metaworld table --out FOLDER
+
+`run` records, extracts, trains and rolls out what is missing in the folder; `table` writes tables
+and a page of what is finished there.
 """
 
 import os
 import sys
 from argparse import ArgumentParser, Namespace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from experiments.metaworld.recording import Record, record
-from pipeline.base.errors import PipelineError
+from pipeline.base.errors import ConfigError, PipelineError
 from pipeline.simulation.meta_world import INSTRUCTIONS, full_name
+
+if TYPE_CHECKING:
+    from experiments.metaworld.protocol import Run
 
 
 def main() -> int:
@@ -26,6 +35,18 @@ def main() -> int:
     one.add_argument("--jobs", type=int, default=len(os.sched_getaffinity(0)))
     one.add_argument("--out", type=Path, required=True)
     one.set_defaults(run=_record)
+    whole = commands.add_parser("run", help="policies and rollouts of the protocol")
+    whole.add_argument("variants", nargs="*", default=["protocol"], metavar="VARIANT")
+    whole.add_argument("--checkpoint", help="a Qwen2.5-VL; the demo's random weights otherwise")
+    whole.set_defaults(run=_protocol)
+    table = commands.add_parser("table", help="tables of what is finished")
+    table.set_defaults(run=_table)
+    for command in (whole, table):
+        command.add_argument("--tasks", nargs="+", default=[*INSTRUCTIONS])
+        command.add_argument("--seeds", type=int, default=3)
+        command.add_argument("--episodes", type=int, default=25, help="of each rollout")
+        command.add_argument("--jobs", type=int, default=len(os.sched_getaffinity(0)))
+        command.add_argument("--out", type=Path, required=True)
     wanted = parser.parse_args()
     try:
         wanted.run(wanted)
@@ -49,6 +70,31 @@ def _record(wanted: Namespace) -> None:
     for kept in record(wanted.out, asked, wanted.jobs):
         failed = f"; the expert failed {len(kept.failed)} more" if kept.failed else ""
         print(f"{wanted.out / kept.task}: {len(kept.seeds)} demonstrations{failed}")
+
+
+def _protocol(wanted: Namespace) -> None:
+    from experiments.metaworld.protocol import run_protocol
+
+    run_protocol(_run(wanted))
+    _table(wanted)
+
+
+def _table(wanted: Namespace) -> None:
+    from experiments.metaworld.table import write_tables
+
+    print(write_tables(_run(wanted)))
+
+
+def _run(wanted: Namespace) -> "Run":
+    from experiments.metaworld.protocol import VARIANTS, Run
+
+    variants = getattr(wanted, "variants", [*VARIANTS])
+    if unknown := [name for name in variants if name not in VARIANTS]:
+        raise ConfigError(f"expected variants of {', '.join(VARIANTS)}, found {', '.join(unknown)}")
+    tasks = tuple(dict.fromkeys(map(full_name, wanted.tasks)))
+    checkpoint = getattr(wanted, "checkpoint", None)
+    sizes = wanted.seeds, wanted.episodes, wanted.jobs
+    return Run(wanted.out.absolute(), tuple(variants), tasks, *sizes, checkpoint)
 
 
 if __name__ == "__main__":

@@ -1,0 +1,224 @@
+"""CortexBench's protocol with this project's pipeline: stores, policies and rollouts of a variant.
+
+    OUT/demonstrations/TASK     recorded sets
+    OUT/vlm                     the demo's model of random weights; any other with --checkpoint
+    OUT/stores/VARIANT-TASK.zarr
+    OUT/policies/VARIANT-TASK-SEED/{model, steps/STEP, rollout/STEP}
+
+What is done already is not done again, so a run that was stopped goes on.
+"""
+
+import os
+import shutil
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from contextlib import redirect_stdout
+from dataclasses import dataclass
+from itertools import product
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any, Final
+from unittest.mock import patch
+
+import yaml
+from tqdm import tqdm
+
+from experiments.metaworld.recording import Record, record, seeds_of
+from pipeline.base.config import Params, load_params
+from pipeline.policy.checkpoint import find_policy, load_policy
+from pipeline.simulation.meta_world import INSTRUCTIONS
+from pipeline.train.loop import Trainer
+from stages import extract, finetune, rollout, train_head
+
+EPISODES: Final = 31
+"""Demonstrations of a task: 25 to train on, as in the protocol, and some for val and test."""
+EVALUATIONS: Final = 3
+"""Rollouts of a training at equal distances, the last of them at its end."""
+JOINT: Final = "all"
+"""In place of a task: one policy for all five."""
+_PARAMS: Final = Path(__file__).with_name("params.yaml")
+
+
+@dataclass(frozen=True)
+class Variant:
+    """What differs from `params.yaml`; stores of variants with equal `features` are shared."""
+
+    features: tuple[str, ...] = ()
+    policy: tuple[str, ...] = ()
+    tuned: bool = False
+    """Whether the model is tuned on all tasks first, and then frozen again."""
+    joint: bool = False
+
+
+VARIANTS: Final[dict[str, Variant]] = {
+    "protocol": Variant(),
+    "one policy": Variant(joint=True),
+    "mean": Variant(features=("vlm.pooling=[mean]",)),
+    "last": Variant(features=("vlm.pooling=[last]",)),
+    "224 pixels": Variant(
+        features=("vlm.image_resize_height=224", "vlm.image_resize_width=224", "vlm.grid=[8, 8]")
+    ),
+    "features off": Variant(policy=("train_head.features_enabled=false",)),
+    "state off": Variant(policy=("train_head.robot_state_enabled=false", "train_head.anchor=none")),
+    "reuse 1": Variant(features=("data.vlm_reuse_count=1",)),
+    "reuse 3": Variant(features=("data.vlm_reuse_count=3",)),
+    "reuse 30": Variant(features=("data.vlm_reuse_count=30",)),
+    "tuned": Variant(tuned=True),
+}
+
+
+@dataclass(frozen=True)
+class Run:
+    """What a run of the protocol is asked for."""
+
+    out: Path
+    variants: tuple[str, ...]
+    tasks: tuple[str, ...] = tuple(INSTRUCTIONS)
+    seeds: int = 3
+    episodes: int = 25
+    jobs: int = 1
+    checkpoint: str | None = None
+
+    def policies(self) -> Iterator["TrainedPolicy"]:
+        """The policies of all variants, by seed first: a table of one seed is soon there."""
+        for seed, name in product(range(self.seeds), self.variants):
+            tasks = (JOINT,) if VARIANTS[name].joint else self.tasks
+            yield from (TrainedPolicy(self, name, task, seed) for task in tasks)
+
+
+@dataclass(frozen=True)
+class TrainedPolicy:
+    """One policy: where it lies, and what it is made and judged by."""
+
+    run: Run
+    variant: str
+    task: str
+    seed: int
+
+    @property
+    def folder(self) -> Path:
+        """Where its training and its rollouts are."""
+        return self.run.out / "policies" / f"{_slug(self.variant)}-{self.task}-{self.seed}"
+
+    @property
+    def steps(self) -> Path:
+        """Its checkpoints that are rolled out, each in a folder named by its step."""
+        return self.folder / "steps"
+
+    @property
+    def tasks(self) -> tuple[str, ...]:
+        """The tasks that it learns."""
+        return self.run.tasks if self.task == JOINT else (self.task,)
+
+    @property
+    def store(self) -> Path:
+        """Its store, which policies with the same features share."""
+        own = VARIANTS[self.variant]
+        features = own.features, own.tuned
+        same = (name for name, v in VARIANTS.items() if (v.features, v.tuned) == features)
+        return self.run.out / "stores" / f"{_slug(next(same))}-{self.task}.zarr"
+
+    def params(self, *settings: str) -> Params:
+        """Its params."""
+        run, variant = self.run, VARIANTS[self.variant]
+        sources = [{"name": task, "path": task} for task in self.tasks]
+        told = [f"data.sources={yaml.safe_dump(sources, default_flow_style=True, width=9999)}"]
+        told += [f"vlm.checkpoint={run.checkpoint}"] if run.checkpoint else []
+        told += [f"vlm.adapter={run.out / 'tuned' / 'best' / 'adapter'}"] if variant.tuned else []
+        told += [
+            f"extract.store={self.store}",
+            f"train_head.seed={self.seed}",
+            f"train_head.split={{val: 0.1, test: 0.05, seed: {self.seed}}}",
+            f"train_head.output={self.folder / 'model'}",
+            f"train_head.logs={self.folder / 'logs'}",
+            f"rollout.environment={[f'metaworld:{task}' for task in self.tasks]}",
+            f"rollout.seed={seeds_of('evaluation', self.seed)[0]}",
+            f"rollout.episodes={run.episodes}",
+        ]
+        told += [*variant.features, *variant.policy, *settings]
+        return load_params(run.out / "params.yaml", told)
+
+    def rollouts(self) -> dict[int, Path]:
+        """Where its rollouts are or will be, by step; the training has to be finished."""
+        steps = sorted(int(folder.name) for folder in self.steps.iterdir())
+        return {step: self.folder / "rollout" / str(step) for step in steps}
+
+    @property
+    def done(self) -> bool:
+        """Whether all of its rollouts are there."""
+        finished = (self.folder / "model").exists() and self.steps.exists()
+        return finished and all((f / "report.html").exists() for f in self.rollouts().values())
+
+
+def run_protocol(wanted: Run) -> None:
+    """Do what is missing: recordings, model, stores, policies, rollouts."""
+    out = wanted.out
+    out.mkdir(parents=True, exist_ok=True)
+    text = _PARAMS.read_text(encoding="utf-8").replace("{out}", str(out))
+    (out / "params.yaml").write_text(text, encoding="utf-8")
+    asked = [
+        Record(task=task, run=0, episodes=EPISODES, image=224, shadows=False)
+        for task in wanted.tasks
+    ]
+    record(out / "demonstrations", asked, wanted.jobs)
+    if wanted.checkpoint is None and not (out / "vlm").exists():
+        from pipeline.vlm.demo_checkpoint import write_demo_checkpoint
+
+        write_demo_checkpoint(out / "vlm")
+    missing = [policy for policy in wanted.policies() if not policy.done]
+    if any(VARIANTS[policy.variant].tuned for policy in missing):
+        _tune(wanted)
+    for policy in {policy.store: policy for policy in missing}.values():
+        extract.main(policy.params())
+    os.environ.setdefault("OMP_NUM_THREADS", str(max(1, (os.cpu_count() or 1) // wanted.jobs)))
+    pool = ProcessPoolExecutor(wanted.jobs, get_context("spawn"), max_tasks_per_child=1)
+    try:
+        begun = [pool.submit(train_and_roll_out, policy) for policy in missing]
+        for ended in tqdm(as_completed(begun), "policies", len(begun), unit="policy", disable=None):
+            ended.result()
+    finally:  # what is under way may end, nothing more begins
+        pool.shutdown(cancel_futures=True)
+
+
+def train_and_roll_out(policy: TrainedPolicy) -> None:
+    """Train a policy, keep its checkpoints, and roll out those and the one that val chose.
+
+    What the stages print stands in a file beside its folder.
+    """
+    policy.folder.mkdir(parents=True, exist_ok=True)
+    with policy.folder.with_suffix(".log").open("a") as log, redirect_stdout(log):
+        _train(policy)
+        for step, folder in policy.rollouts().items():
+            if not (folder / "report.html").exists():
+                told = f"rollout.checkpoint={policy.steps / str(step)}", f"rollout.output={folder}"
+                rollout.main(policy.params(*told))
+
+
+def _train(policy: TrainedPolicy) -> None:
+    steps, save = policy.steps, Trainer._save
+
+    def kept(trainer: Trainer, folder: Path, *rest: Any) -> None:
+        save(trainer, folder, *rest)
+        if folder.name == "last":
+            shutil.copytree(folder, steps / str(trainer.step), dirs_exist_ok=True)
+
+    every = policy.params().train_head.max_steps // EVALUATIONS
+    with patch.object(Trainer, "_save", kept):
+        train_head.main(policy.params(f"train_head.checkpoint_every={every}"))
+    best = find_policy(policy.folder / "model")
+    chosen = steps / str(load_policy(best).step)
+    if not chosen.exists():
+        shutil.copytree(best, chosen)
+
+
+def _tune(wanted: Run) -> None:
+    """Tune the model on all tasks, with a policy for all of them on top."""
+    joint, tuned = TrainedPolicy(wanted, "one policy", JOINT, 0), wanted.out / "tuned"
+    if not tuned.exists():
+        told = f"finetune.output={tuned}", f"finetune.logs={wanted.out / 'tuning'}"
+        extract.main(joint.params())
+        finetune.main(joint.params(*told))
+
+
+def _slug(name: str) -> str:
+    return name.replace(" ", "-")
