@@ -1,4 +1,4 @@
-"""Run a trained policy closed loop in the simulated needle insertion, and count its successes.
+"""Run a trained policy closed loop in a simulation, and count its successes.
 
 Reads what stages.train_head wrote to train_head.output, or rollout.checkpoint if it is set, and the
 model of vlm.checkpoint, which must give the features that the policy was trained on. For comparison
@@ -9,6 +9,7 @@ policy's success alone, for `dvc metrics show`), episodes.csv (the policy's epis
 
   python -m stages.rollout                                     50 episodes at level full
   python -m stages.rollout --set rollout.level=moved           the target is pushed meanwhile
+  python -m stages.rollout --set rollout.environment=metaworld:assembly-v3   a task of Meta-World
   python -m stages.rollout --set rollout.chunking=none         another way to play chunks
   python -m stages.rollout --set 'rollout.latency_ms=[0, 300, 600]'   success against latency
   python -m stages.rollout --set rollout.head=models/export    what stages.export wrote answers
@@ -80,7 +81,7 @@ def _here(params: "Params", say: Callable[[str], None]) -> "Rollouts":
         from pipeline.robot.export import ExportedHead
 
         act, answers = ExportedHead(wanted.head, checkpoint).act, f", {wanted.head} answers"
-    say(f"{folder} (step {checkpoint.step}), level {wanted.level}, device {device}{answers}")
+    say(f"{folder} (step {checkpoint.step}), {_where(wanted)}, device {device}{answers}")
     return roll_out(checkpoint, str(folder), checkpoint.policy(device), load, wanted, say, act)
 
 
@@ -93,8 +94,15 @@ def _served(wanted: "RolloutParams", say: Callable[[str], None]) -> "Rollouts":
     with PolicyClient(wanted.server, token=os.environ.get(TOKEN_VARIABLE)) as server:
         policy = server.metadata
         name, step = policy["checkpoint"], policy["step"]
-        say(f"{wanted.server}: {name} (step {step}), level {wanted.level}")
+        say(f"{wanted.server}: {name} (step {step}), {_where(wanted)}")
         return roll_out_served(server, wanted, say)
+
+
+def _where(wanted: "RolloutParams") -> str:
+    from pipeline.base.config import PHANTOM, environments
+
+    names = environments(wanted.environment)
+    return f"level {wanted.level}" if names == (PHANTOM,) else ", ".join(names)
 
 
 def _write(folder: Path, rollouts: "Rollouts") -> list[Path]:
