@@ -3,6 +3,7 @@
 import json
 from collections.abc import Callable
 from concurrent.futures import Future
+from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -69,11 +70,13 @@ def test_a_set_is_what_the_expert_did_and_is_recorded_once(tmp_path: Path) -> No
 def test_the_protocol_goes_from_demonstrations_to_a_table(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Tiny: three demonstrations of one task, six steps, three rollouts of one episode."""
+    """Tiny: three demonstrations of one task, six steps, rollouts of one episode."""
     from experiments.metaworld import protocol
     from experiments.metaworld.table import judged, write_tables
 
     monkeypatch.setattr(protocol, "EPISODES", 3)
+    blind = replace(protocol.VARIANTS["features off"], evaluations=3)
+    monkeypatch.setitem(protocol.VARIANTS, "features off", blind)
     monkeypatch.setattr("pipeline.simulation.meta_world.MAX_TICKS", 60)
     small = {"max_steps: 1500": "max_steps: 6", "eval_every: 250": "eval_every: 3"}
     text = protocol._PARAMS.read_text(encoding="utf-8")

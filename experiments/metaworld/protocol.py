@@ -31,9 +31,7 @@ from pipeline.train.loop import Trainer
 from stages import extract, finetune, rollout, train_head
 
 EPISODES: Final = 31
-"""Demonstrations of a task: 25 to train on, as in the protocol, and some for val and test."""
-EVALUATIONS: Final = 3
-"""Rollouts of a training at equal distances, the last of them at its end."""
+"""Demonstrations of a task: the split leaves 25 to 29 to train on; the protocol has 25."""
 JOINT: Final = "all"
 """In place of a task: one policy for all five."""
 _PARAMS: Final = Path(__file__).with_name("params.yaml")
@@ -48,10 +46,12 @@ class Variant:
     tuned: bool = False
     """Whether the model is tuned on all tasks first, and then frozen again."""
     joint: bool = False
+    evaluations: int = 1
+    """How often a training is rolled out, at equal distances, the last time at its end."""
 
 
 VARIANTS: Final[dict[str, Variant]] = {
-    "protocol": Variant(),
+    "protocol": Variant(evaluations=3),
     "one policy": Variant(joint=True),
     "mean": Variant(features=("vlm.pooling=[mean]",)),
     "last": Variant(features=("vlm.pooling=[last]",)),
@@ -63,7 +63,7 @@ VARIANTS: Final[dict[str, Variant]] = {
     "reuse 1": Variant(features=("data.vlm_reuse_count=1",)),
     "reuse 3": Variant(features=("data.vlm_reuse_count=3",)),
     "reuse 30": Variant(features=("data.vlm_reuse_count=30",)),
-    "tuned": Variant(tuned=True),
+    "tuned": Variant(tuned=True, evaluations=3),
 }
 
 
@@ -202,7 +202,7 @@ def _train(policy: TrainedPolicy) -> None:
         if folder.name == "last":
             shutil.copytree(folder, steps / str(trainer.step), dirs_exist_ok=True)
 
-    every = policy.params().train_head.max_steps // EVALUATIONS
+    every = policy.params().train_head.max_steps // VARIANTS[policy.variant].evaluations
     with patch.object(Trainer, "_save", kept):
         train_head.main(policy.params(f"train_head.checkpoint_every={every}"))
     best = find_policy(policy.folder / "model")
