@@ -4,7 +4,7 @@ Reads probe.store (extract.store if null), and its checksums first (probe.check_
 each slot, and each choice of layer, norm and pooling as a whole: alone, and together with past
 actions, state and sensor, cross-validated by recording. Prints the ranking with 95 % intervals and
 the line for params.yaml that the results support. Writes metrics.json, slots.csv, groups.csv,
-targets.csv and a picture (PNG) into probe.output.
+targets.csv and a page (report.html) into probe.output.
 
   python -m stages.probe                             as params.yaml stands
   python -m stages.probe --set probe.max_ticks=2000  that many ticks, evenly spread: a first look
@@ -32,8 +32,8 @@ def main(params: "Params") -> None:
     from pipeline.base.files import REPORT, claim, refuse_foreign
     from pipeline.evaluate.probe.study import probe
     from pipeline.evaluate.probe.tables import advice, table, write_tables
-    from pipeline.look.page.style import write
-    from pipeline.look.probe import draw_gains
+    from pipeline.look.page.writing import write_report
+    from pipeline.look.probe import probe_report
     from pipeline.store import FeatureStore, check_trailers
 
     wanted = params.probe
@@ -47,7 +47,7 @@ def main(params: "Params") -> None:
     claim(wanted.output, REPORT)
     files = [
         *write_tables(wanted.output, study),
-        *write(wanted.output, {"probe.png": lambda: draw_gains(study)}),
+        *write_report(wanted.output, probe_report(study, store.path.name)),
     ]
     print(table(study))
     print(advice(study))

@@ -63,7 +63,7 @@ VARIANTS: Final[dict[str, Variant]] = {
     "reuse 1": Variant(features=("data.vlm_reuse_count=1",)),
     "reuse 3": Variant(features=("data.vlm_reuse_count=3",)),
     "reuse 30": Variant(features=("data.vlm_reuse_count=30",)),
-    "tuned": Variant(tuned=True, evaluations=3),
+    "tuned": Variant(tuned=True),
 }
 
 

@@ -26,6 +26,11 @@ def size(count: float) -> str:
     return f"{count / 2**10:.0f} KiB" if count >= 2**10 else f"{count:.0f} B"
 
 
+def counted(count: int, noun: str) -> str:
+    """`1 episode`, `1,200 episodes`."""
+    return f"{count:,} {noun}" + "s" * (count != 1)
+
+
 def duration(seconds: float) -> str:
     """Seconds to three digits; minutes from two minutes on, hours from two hours on."""
     if seconds < 120:
@@ -52,6 +57,8 @@ NOTHING = "–"
 """Stands for a missing value."""
 DIGITS = 4
 """Significant digits of a number that is not a count."""
+NOISE = 1e-9
+"""A number below this is written as nearly 0."""
 PLAIN = (1e-4, 1e7)
 """Magnitudes outside these are written with an exponent."""
 
@@ -128,7 +135,10 @@ class Table:
 
 
 def number(value: float) -> str:
-    """A number with four significant digits and thousands separators; NaN is an en dash."""
+    """A number with four significant digits and thousands separators; NaN is an en dash.
+
+    What is smaller than `NOISE` is the rounding of a computer, in every unit that is used here.
+    """
     value = float(value)
     if math.isnan(value):
         return NOTHING
@@ -137,6 +147,8 @@ def number(value: float) -> str:
     size = abs(value)
     if size == 0:
         return "0"
+    if size < NOISE:
+        return "≈ 0"
     if not PLAIN[0] <= size < PLAIN[1]:
         return f"{value:.{DIGITS - 1}e}"
     # Taken from the rounded number, because 9.9999 becomes 10.00.

@@ -12,7 +12,7 @@ from pipeline.evaluate.experiments import SPANS, Experiment, best_experiment, ex
 from pipeline.evaluate.figures import NO_INTERVAL
 from pipeline.evaluate.tables import FOOTNOTE
 from pipeline.look.evaluation import LABELS, STYLES, draw_bar
-from pipeline.look.page.blocks import Picture, Report, Section
+from pipeline.look.page.blocks import Picture, Report, Section, next_steps
 from pipeline.look.page.style import INK, finish, panels
 from pipeline.look.page.writing import sentence
 
@@ -50,10 +50,28 @@ def comparison_report(experiments: Sequence[Experiment]) -> Report:
         summary += f" {sentence(NO_INTERVAL)}"
     return Report(
         title="Experiments side by side",
+        verdict=_verdict(experiments),
         summary=summary,
         tiles=tuple(tiles),
-        sections=(Section("Errors", (*tables, picture)),),
+        sections=(
+            Section("Errors", (*tables, picture)),
+            next_steps(
+                "Train the best with several values of `train_head.seed`: seeds differ, too.",
+                "Roll out the best two (`vla-cache rollout`): errors do not tell who succeeds.",
+            ),
+        ),
     )
+
+
+def _verdict(experiments: Sequence[Experiment]) -> str:
+    """Which experiment errs least in what is executed, and whether its lead is resolved."""
+    best = best_experiment(experiments, "executed")
+    others = [other for other in experiments if other is not best]
+    leads = [best.minus(other, "executed").resolved for other in others]
+    if not others:
+        return f"{best.name} stands alone"
+    lead = "and is ahead of all others" if all(leads) else "but its lead is not resolved"
+    return f"{best.name} errs least in what is executed, {lead}"
 
 
 def draw_experiments(experiments: Sequence[Experiment]) -> Figure:

@@ -21,7 +21,7 @@ from pipeline.evaluate.evaluation import Evaluation, trained_on_too
 from pipeline.evaluate.figures import NO_INTERVAL, best_baseline, error, rivalry, with_unit
 from pipeline.evaluate.figures import Figure as Merit
 from pipeline.evaluate.sources import TrainingCurves, read_episode_frames, shown_ticks
-from pipeline.look.page.blocks import Block, Outline, Picture, Report, Section, Text
+from pipeline.look.page.blocks import Block, Outline, Picture, Report, Section, Text, next_steps
 from pipeline.look.page.style import (
     INK,
     PALETTE,
@@ -65,6 +65,16 @@ _CURVES = {
     "lr": ("learning rate", PALETTE[2]),
 }
 """Training curve -> title and colour."""
+_FEW = 10
+"""Fewer groups of test recordings say little."""
+_DOING = {
+    "zero_action": "standing still",
+    "median_action": "the median action",
+    "repeat_last": "repeating the last action",
+    "linear_fit": "a linear fit on the two past actions",
+    "nearest_neighbour": "copying the nearest neighbour",
+}
+"""The baselines, as a sentence has them."""
 _INSTANTS = 5
 """Ticks of an episode at which its frames are shown."""
 _EPISODES = 40
@@ -87,6 +97,7 @@ def evaluation_report(evaluation: Evaluation, rollout: str = "") -> Report:
     notes = [note for note in (trained_on_too(evaluation.checkpoint), still) if note]
     return Report(
         title=f"Evaluation of {evaluation.name}",
+        verdict=_verdict(comparison),
         summary=(
             f"{policy['model_type']} expert, {policy['fusion_strategy']} fusion, step "
             f"{policy['step']}, {policy['parameters']:,} parameters, judged on "
@@ -104,8 +115,41 @@ def evaluation_report(evaluation: Evaluation, rollout: str = "") -> Report:
             Section("Which streams are used", _modalities(evaluation.study)),
             Section("Training", _training(evaluation)),
             Section("What was judged", _documents(evaluation)),
+            next_steps(*_advice(evaluation, rollout)),
         ),
     )
+
+
+def _verdict(comparison: Comparison) -> str:
+    """The policy's executed steps beside the best baseline, in words."""
+    rivals = rivalry(comparison.executed)
+    best = _DOING[rivals.best]
+    if rivals.ratio is None or rivals.difference.resolved is False:
+        return f"Not told apart from {best}, in what is executed"
+    if rivals.ratio <= 1:
+        return f"In what is executed, the policy errs {_times(1 / rivals.ratio)} less than {best}"
+    return f"In what is executed, the policy is {_times(rivals.ratio)} worse than {best}"
+
+
+def _times(ratio: float) -> str:
+    """`3.2 times`; `8 %` for less than twice."""
+    return f"{ratio - 1:.0%}" if ratio < 2 else f"{ratio:.2g} times"
+
+
+def _advice(evaluation: Evaluation, rollout: str) -> Iterator[str]:
+    executed = evaluation.comparison.executed
+    rivals, groups = rivalry(executed), len(np.unique(executed.cells.group))
+    if rivals.verdict != "better":
+        yield (
+            "Look below at which streams are used and at the training curve, then go through "
+            "docs/worse.md: it says which switch first."
+        )
+    if groups < _FEW:
+        yield f"Hold out more: {groups} group(s) of test recordings leave wide intervals."
+    if rollout:
+        yield "See the rollouts: whether the task succeeds, errors cannot tell."
+    elif rivals.verdict == "better":
+        yield "Count successes: `vla-cache rollout` in a simulation, `vla-cache drive` on an arm."
 
 
 def _tiles(comparison: Comparison) -> list[tuple[str, str]]:

@@ -1,19 +1,52 @@
-"""The picture of a probe: which layers and which cells of the image predict the action."""
+"""The page of a probe: which layers and which cells of the image predict the action."""
 
 from collections import defaultdict
 from collections.abc import Sequence
+from functools import partial
 
 import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from pipeline.evaluate.probe.inputs import SlotName
-from pipeline.evaluate.probe.study import ProbeResult, ProbeStudy
+from pipeline.evaluate.probe.study import ProbeResult, ProbeStudy, recommend
+from pipeline.evaluate.probe.tables import advice, notes, ranking
+from pipeline.look.page.blocks import Picture, Report, Section, Text, next_steps
 from pipeline.look.page.style import canvas, draw_map
 
 _MAPS = 6
 """The most maps of the cells of a view; the layers of a model look alike."""
 _MAPS_A_ROW = 3
+
+
+def probe_report(study: ProbeStudy, store: str) -> Report:
+    """The page of a probe of the store of this name."""
+    advised = recommend(study)
+    caption = "What each slot adds to what is known without features."
+    return Report(
+        title=f"Probe of {store}",
+        verdict=(
+            "No choice of features helps a linear reader here"
+            if advised is None
+            else f"Keep {advised.chosen.name.label}"
+        ),
+        summary=(
+            f"R² of the action chunk of {study.horizon} ticks on held-out recordings: 1 is exact, "
+            "0 no better than their mean."
+        ),
+        sections=(
+            Section(
+                "What predicts the action",
+                [Picture("probe", caption, partial(draw_gains, study)), ranking(study)]
+                + [Text(note) for note in notes(study)],
+            ),
+            next_steps(
+                *advice(study).splitlines(),
+                "Train on that choice and on all of it, and roll both out: a probe is linear."
+                * (advised is not None),
+            ),
+        ),
+    )
 
 
 def draw_gains(study: ProbeStudy) -> Figure:

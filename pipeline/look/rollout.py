@@ -1,5 +1,6 @@
 """The page of a policy's rollouts: how often it succeeds, and how it fails."""
 
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from typing import Any
@@ -9,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from pipeline.evaluate.rollouts import RolloutEpisode, Rollouts, SuccessRate, controller_name
-from pipeline.look.page.blocks import Block, Outline, Picture, Report, Section, Text
+from pipeline.look.page.blocks import Block, Outline, Picture, Report, Section, Text, next_steps
 from pipeline.look.page.style import INK, PALETTE, canvas, draw_strip, finish, panels
 from pipeline.look.page.writing import sentence
 from pipeline.simulation.insertion import (
@@ -47,6 +48,8 @@ _WIDTH = 9.0
 _OTHER = "#999999"
 """Colour of an episode among many."""
 _OUTCOMES = {True: ("inserted", PALETTE[0], "o"), False: ("not inserted", PALETTE[5], "X")}
+_GOOD, _WIDE = 0.9, 0.15
+"""A rate from which a policy may go on to an arm; a width of its interval that says little."""
 _MANY = 100
 """With more episodes than this, the page has the paths as pixels: thousands of lines are slow."""
 
@@ -64,6 +67,9 @@ def rollout_report(rollouts: Rollouts) -> Report:
     levels = f"level {rollouts.levels[0]}" if inserts else ", ".join(rollouts.levels)
     return Report(
         title=f"Rollouts of {rollouts.checkpoint}",
+        verdict=(
+            f"The policy succeeds in {sum(e.success for e in episodes)} of {len(episodes)} episodes"
+        ),
         summary=(
             f"The policy acts in the simulated {where} and sees what its actions lead to. "
             f"Episodes that succeed at {levels}: {shares}."
@@ -78,8 +84,29 @@ def rollout_report(rollouts: Rollouts) -> Report:
             *([Section("Where the needle went", _paths_and_courses(rollouts))] if inserts else []),
             Section("Episodes closely", (), tuple(_filmstrips(rollouts))),
             Section("What was run", [Outline("Settings of the rollout", rollouts.settings)]),
+            next_steps(*_advice(rollouts)),
         ),
     )
+
+
+def _advice(rollouts: Rollouts) -> Iterator[str]:
+    rates, failed = rollouts.rates(), [e.reason for e in rollouts.of("policy") if not e.success]
+    policy = rates["policy"]
+    for name, rate in rates.items():
+        if name.endswith("off") and rate.rate >= policy.low:
+            yield (
+                f"With its {name} the policy may succeed as often: see whether that stream tells "
+                "what the task needs (`vla-cache probe` for features)."
+            )
+    if failed:
+        reason, count = Counter(failed).most_common(1)[0]
+        yield f"Most failures end by: {reason} ({count}). Look at the worst episode's film above."
+    if policy.high - policy.low > _WIDE:
+        yield "Run more episodes (`rollout.episodes: 200`) before two policies are compared."
+    if policy.rate < _GOOD:
+        yield "Record more demonstrations, above all of what fails; docs/worse.md has the order."
+    else:
+        yield "`vla-cache serve` serves the policy, `vla-cache drive` runs it on an arm."
 
 
 def _lateness(rollouts: Rollouts) -> Iterator[Section]:

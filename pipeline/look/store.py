@@ -24,8 +24,17 @@ from pipeline.base.channels import named
 from pipeline.base.commands import command
 from pipeline.base.config import InspectParams, setting
 from pipeline.base.errors import Issue, Severity, StoreIncomplete
-from pipeline.base.text import Table, duration, size
-from pipeline.look.page.blocks import Block, Issues, Outline, Picture, Report, Section, Text
+from pipeline.base.text import Table, counted, duration, size
+from pipeline.look.page.blocks import (
+    Block,
+    Issues,
+    Outline,
+    Picture,
+    Report,
+    Section,
+    Text,
+    next_steps,
+)
 from pipeline.look.page.style import GRID, PALETTE, draw_map, panels
 from pipeline.store import FEATURES, KEY_BYTES, Episode, FeatureStore, check_trailers, episode_name
 from pipeline.store.border import extract_command
@@ -142,6 +151,11 @@ def store_report(view: StoreView) -> Report:
     total = len(store.array("vl/time"))
     return Report(
         title=f"Store: {store.path.name}",
+        verdict=(
+            f"{counted(len(view.issues), 'finding')} to look at before training"
+            if view.issues
+            else "Ready to train on: nothing looks wrong"
+        ),
         summary=(
             f"Ticks {rate}, features of the model (a VL row) at {often}; feature spec "
             f"`{store.spec['digest']}`."
@@ -167,6 +181,12 @@ def store_report(view: StoreView) -> Report:
                         "Computed with", {"environments of VL rows": store.attrs["environment"]}
                     ),
                 ],
+            ),
+            next_steps(
+                "Look at each finding above; `vla-cache verify` reads every row."
+                * bool(view.issues),
+                "`vla-cache probe` says which layers and poolings predict the action.",
+                "`vla-cache train_head` trains a policy, `vla-cache evaluate` judges it.",
             ),
         ),
     )

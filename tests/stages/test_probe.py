@@ -16,7 +16,7 @@ from pipeline.store.chunks import write_seal
 from stages import probe
 from stages.command import run
 
-FILES = ["groups.csv", "metrics.json", "probe.png", "slots.csv", "targets.csv"]
+FILES = ["groups.csv", "metrics.json", "probe.png", "report.html", "slots.csv", "targets.csv"]
 
 
 @pytest.fixture

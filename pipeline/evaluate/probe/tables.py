@@ -61,7 +61,7 @@ def metrics(study: ProbeStudy) -> dict[str, Any]:
     return document
 
 
-def table(study: ProbeStudy) -> str:
+def ranking(study: ProbeStudy) -> Table:
     """The groups and the best slots, ranked, below the baselines."""
     baselines = [("mean action", 0, study.mean_action)]
     baselines += [(known.name, known.inputs, known.score) for known in study.known]
@@ -74,7 +74,13 @@ def table(study: ProbeStudy) -> str:
         rows.append([result.name.label + several, result.inputs, f"{result.valid_share:.0%}"])
         figures = (result.alone.r2, result.beside.r2, study.gain(result))
         rows[-1] += [figure.text("+") for figure in figures]
-    heads = ["what is read", "inputs", "valid", "R2 alone", "R2 beside", "gain"]
+    heads = ["what is read", "gain", "R2 beside", "R2 alone", "inputs", "valid"]
+    return Table(heads, [[row[0], row[5], row[4], row[3], row[1], row[2]] for row in rows])
+
+
+def notes(study: ProbeStudy) -> list[str]:
+    """What a reader of the ranking has to know."""
+    single = sum(result.name != result.name.group for result in study.slots)
     lines = [
         f"R2 of the action chunk of {study.horizon} ticks on recordings that were held out, mean "
         "over channels and steps (1: exact, 0: no better than their mean)",
@@ -82,14 +88,18 @@ def table(study: ProbeStudy) -> str:
         f"{study.folds.count} folds, dealt {len(study.folds.deals)} times",
         "in brackets 95 % intervals: recordings drawn anew, in each deal of the folds",
         f"beside: together with {study.baseline.name}; gain: what that adds to them",
-        *Table(heads, rows).text(),
         *study.folds.notes,
         "inputs fewer than channels are their main directions over all folds",
         "valid: the share of ticks that have a slot; elsewhere its mean is read",
     ]
-    if len(single) > TOP:
-        lines.append(f"the other {len(single) - TOP} slots are in slots.csv")
-    return "\n".join(lines)
+    if single > TOP:
+        lines.append(f"the other {single - TOP} slots are in slots.csv")
+    return lines
+
+
+def table(study: ProbeStudy) -> str:
+    """The ranking and its notes, for a terminal."""
+    return "\n".join([*ranking(study).text(), *notes(study)])
 
 
 def advice(study: ProbeStudy) -> str:

@@ -81,6 +81,11 @@ class Section:
     parts: Sequence["Section"] = ()
 
 
+def next_steps(*steps: str) -> Section:
+    """The last section of a page: what to do next, by the figures that the page shows."""
+    return Section("What to do next", [Text(step) for step in steps if step])
+
+
 BlockKind = TypeVar("BlockKind", bound=Block)
 
 
@@ -93,6 +98,8 @@ class Report:
     tiles: Sequence[tuple[str, str]] = ()
     """(label, value), shown large at the top."""
     sections: Sequence[Section] = ()
+    verdict: str = ""
+    """What the page comes to, in a sentence, shown large above the summary."""
 
     def blocks(self, kind: type[BlockKind]) -> Iterator[BlockKind]:
         """Its blocks of this kind, in reading order."""

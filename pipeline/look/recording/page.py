@@ -18,12 +18,12 @@ from tqdm import tqdm
 
 from pipeline.base.config import Params
 from pipeline.base.errors import Issue, RecordingError, StoreMismatch
-from pipeline.base.text import Table, duration
+from pipeline.base.text import Table, counted, duration
 from pipeline.data import Opened, Recording
 from pipeline.data.episode import Embodiment, common_embodiment
 from pipeline.data.recording import Nominal
 from pipeline.data.timeline import ActionRotation, choose_action_rotation, rate_notes
-from pipeline.look.page.blocks import Issues, Picture, Report, Section, Text
+from pipeline.look.page.blocks import Issues, Picture, Report, Section, Text, next_steps
 from pipeline.look.recording.cameras import camera_blocks, find_frame_issues
 from pipeline.look.recording.clocks import clock_blocks, find_clock_issues
 from pipeline.look.recording.episode import Draw, EpisodeView, view_episode
@@ -42,6 +42,8 @@ _TOPICS = {
     "Clocks": clock_blocks,
     "Statistics by channel": statistics_blocks,
 }
+_FEW = 30
+"""Fewer episodes leave too few to test on."""
 NOTHING = "Nothing looks wrong: every episode was read and every check passed."
 # Most episodes in the table of all: those with issues, then the first.
 ROWS = 100
@@ -322,12 +324,47 @@ def recordings_report(opened: Opened, params: Params, name: str) -> Report:
     rate = "the recorded rows" if data.action_hz is None else f"{data.action_hz:g} Hz"
     summary = f"Ticks at {rate}, one VL row every {data.vlm_reuse_count} ticks. Times count from "
     summary += "the first instant of an episode."
-    return Report(f"Recordings: {name}", summary, _tiles(overview), sections)
+    sections.append(next_steps(*_advice(overview)))
+    return Report(f"Recordings: {name}", summary, _tiles(overview), sections, _verdict(overview))
+
+
+def _wrong(overview: RecordingsOverview) -> tuple[int, int]:
+    """The numbers of errors and of warnings."""
+    errors = sum(issue.severity == "error" for issue in overview.issues)
+    return errors, len(overview.issues) - errors
+
+
+def _verdict(overview: RecordingsOverview) -> str:
+    errors, warnings = _wrong(overview)
+    if errors:
+        return f"{counted(errors, 'error')} to mend before extraction"
+    if warnings:
+        return f"Ready to extract, with {counted(warnings, 'warning')} to look at"
+    return "Ready to extract: nothing looks wrong"
+
+
+def _advice(overview: RecordingsOverview) -> Iterator[str]:
+    errors, warnings = _wrong(overview)
+    if errors:
+        yield (
+            "Mend what the errors name and look again, or leave those episodes out: "
+            "`data.on_bad_episode: skip`."
+        )
+    if warnings:
+        yield "Look at each warning in the pictures: it may be the robot's, or the recorder's."
+    episodes = len(overview.summaries)
+    if episodes < _FEW:
+        yield (
+            f"Record more: {counted(episodes, 'episode')} can show that the pipeline runs, not "
+            f"that a policy works. {_FEW} or more leave enough to test on."
+        )
+    if not errors:
+        yield "Name the recordings in `data.sources`, then `vla-cache extract`."
 
 
 def _tiles(overview: RecordingsOverview) -> list[tuple[str, str]]:
-    summaries, issues = overview.summaries, overview.issues
-    errors = sum(issue.severity == "error" for issue in issues)
+    summaries = overview.summaries
+    errors, warnings = _wrong(overview)
     return [
         ("episodes", f"{len(summaries):,}"),
         ("recorded", duration(sum(summary.duration_s for summary in summaries))),
@@ -335,7 +372,7 @@ def _tiles(overview: RecordingsOverview) -> list[tuple[str, str]]:
         ("VL rows", f"{sum(summary.vl_rows for summary in summaries):,}"),
         ("cameras", f"{len(overview.views)}"),
         ("errors", f"{errors:,}"),
-        ("warnings", f"{len(issues) - errors:,}"),
+        ("warnings", f"{warnings:,}"),
     ]
 
 

@@ -25,7 +25,7 @@ from pipeline.vlm.processor import TokenKind
 
 # The picture fills this width unless its columns get too narrow: so its smallest text, 8 points, is
 # no smaller than 8 pixels on a page. Labels and legends are beside the columns.
-_WIDTH_IN, _BESIDE_IN = 10.0, 1.6
+_WIDTH_IN, _BESIDE_IN = 10.0, 3.0
 _LEAST_COLUMN_IN, _COLUMN_IN, _PANEL_IN = 1.65, 2.5, 1.15
 _SMALL = 8
 # Characters of a title over the whole width.
@@ -123,9 +123,13 @@ def draw_samples(
         for line_axes, (name, frame) in zip(axes, sample.frames.items(), strict=False):
             draw_frame(line_axes[place], frame)
             line_axes[0].set_ylabel(name, fontsize=_SMALL)
+    middle = (len(samples) - 1) // 2
     for line_axes, (name, group) in zip(axes[len(views) :], rows, strict=True):
         values = [sample.windows[name][:, group.indices] for sample in samples]
         _draw_row(line_axes, name, group, values, lengths[name])
+        if group is [other for stream, other in rows if stream == name][-1]:
+            along = "steps ahead" if name == "action" else "readings before the tick"
+            line_axes[middle].set_xlabel(along, fontsize=_SMALL)
     episode = view.recording.id.split("/")[-1]
     figure.suptitle(f"{episode}\n“{view.instruction}”"[:_TITLE], fontsize=9)
     return figure
@@ -173,10 +177,8 @@ def _draw_row(
         axis.set_xlim(start, stop)
         axis.tick_params(labelsize=_SMALL)
     label = f"{name}\n{group.label}" + (", depth" if group.profile else "")
-    label += "\nchange since the\nwindow began" if name == "state" else ""
+    label += "\nchange" if name == "state" else ""
     axes[0].set_ylabel(label, fontsize=_SMALL)
-    along = "steps ahead" if ahead else "readings before the tick"
-    axes[(len(axes) - 1) // 2].set_xlabel(along, fontsize=_SMALL)
     if len(group.names) > 1 and not group.profile:
         # The last sample's window is the fullest: a single reading has a marker, not a line.
         legend_beside(axes[-1])

@@ -1,7 +1,9 @@
 """Sensor, state and actions: pictures, statistics by channel, and what looks wrong in them."""
 
+import re
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
+from itertools import groupby
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -19,7 +21,7 @@ from pipeline.data import Channels, Stream
 from pipeline.data.contact import CONTACT_RULE, contact_spans, force_columns
 from pipeline.data.timeline import last_at
 from pipeline.look.page.blocks import Block
-from pipeline.look.page.style import PALETTE, panels
+from pipeline.look.page.style import PALETTE, panels, shorten_middle
 from pipeline.look.recording.clocks import Clock, usual_step
 from pipeline.look.recording.episode import Draw, EpisodeView, runs
 
@@ -36,6 +38,12 @@ _SORTED = 16
 
 CONTACT_COLOUR = "#E69F00"
 _LINES = cycler(ls=("-", "--", ":")) * cycler(color=PALETTE)
+# Most curves in a panel.
+_TOGETHER = 9
+# Fewest channels of a limb.
+_LIMB = 3
+# Characters of a name in a legend, at its beginning and at its end.
+_BEGIN, _END = 13, 10
 _WIDTH_IN, _PANEL_IN, _IMAGE_IN = 10.0, 1.75, 2.6
 # A group whose channels move less than this share of its span is drawn as changes.
 _STANDS_STILL = 0.2
@@ -46,7 +54,7 @@ _LEAST_S = 1e-3
 
 
 class ChannelGroup(NamedTuple):
-    """Channels that share a panel: those of one unit, or one quantity over place.
+    """Channels that share a panel: some of one unit, or one quantity over place.
 
     `profile` is the common name of the depths of an A-scan and the like, else ''.
     """
@@ -64,7 +72,11 @@ class ChannelGroup(NamedTuple):
 
 
 def group_channels(channels: Channels) -> list[ChannelGroup]:
-    """The channels by unit, in their order; then profiles. Grippers are groups of their own."""
+    """The channels by unit, in their order; then profiles. Grippers are groups of their own.
+
+    More than `_TOGETHER` of one unit are cut into groups: where the first word of the names changes
+    from one limb to the next (left, right, …), and then evenly.
+    """
     kinds = list(zip(map(unnumbered, channels.names), channels.units, strict=True))
     counts = Counter(kinds)
     groups: dict[tuple[str, str, bool], ChannelGroup] = {}
@@ -74,7 +86,27 @@ def group_channels(channels: Channels) -> list[ChannelGroup]:
         group = groups.setdefault(key, ChannelGroup(profile, unit, [], []))
         group.indices.append(index)
         group.names.append(name)
-    return sorted(groups.values(), key=lambda group: bool(group.profile))
+    small = [part for group in groups.values() for part in _cut(group)]
+    return sorted(small, key=lambda group: bool(group.profile))
+
+
+def _cut(group: ChannelGroup) -> Iterator[ChannelGroup]:
+    if group.profile or len(group.names) <= _TOGETHER:
+        yield group
+        return
+    pairs = zip(group.indices, group.names, strict=True)
+    limbs: list[list[tuple[int, str]]] = []
+    for _, alike in groupby(pairs, lambda pair: re.split(r"[^a-zA-Z]", pair[1])[0]):
+        limb = list(alike)
+        if limbs and min(len(limbs[-1]), len(limb)) < _LIMB:
+            limbs[-1] += limb
+        else:
+            limbs.append(limb)
+    for limb in limbs:
+        parts = -(-len(limb) // _TOGETHER)
+        for at in np.array_split(np.arange(len(limb)), parts):
+            indices, names = zip(*(limb[place] for place in at), strict=True)
+            yield ChannelGroup("", group.unit, [*indices], [*names])
 
 
 def named_groups(streams: Mapping[str, Stream]) -> list[tuple[str, ChannelGroup]]:
@@ -180,10 +212,11 @@ def plot_curves(
 
 
 def legend_beside(axis: Axes) -> None:
-    """Draw the legend of a panel to its right; in columns if it is long."""
-    columns = 1 + len(axis.get_legend_handles_labels()[1]) // 8
+    """Draw the legend of a panel to its right, long names without their middles."""
+    handles, names = axis.get_legend_handles_labels()
+    labels = [shorten_middle(name, _BEGIN, _END) for name in names]
     place: dict[str, Any] = {"loc": "center left", "bbox_to_anchor": (1.005, 0.5)}
-    axis.legend(fontsize=8, ncols=columns, handlelength=1.6, **place)
+    axis.legend(handles, labels, fontsize=8, handlelength=1.6, labelspacing=0.3, **place)
 
 
 def _panels(groups: Sequence[ChannelGroup]) -> tuple[Figure, list[Axes]]:

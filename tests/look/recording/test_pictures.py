@@ -222,3 +222,21 @@ def saved(figure: Figure, format: str) -> bytes:
     stream = io.BytesIO()
     figure.savefig(stream, format=format, dpi=30)
     return stream.getvalue()
+
+
+@pytest.mark.parametrize("channels", [2, 26, 64])
+def test_many_channels_share_panels_of_few_and_no_name_is_long(felt: Felt, channels: int) -> None:
+    """A limb stays together: two arms of seven joints, two hands of six fingers."""
+    arm = [f"{side}_joint_{number}" for side in ("left", "right") for number in range(7)]
+    hand = [f"{side}_hand_thumb_rotation_{n}" for side in ("left", "right") for n in range(6)]
+    names = (arm + hand)[:channels] if channels < 27 else [f"joint_{n}" for n in range(channels)]
+    time = np.arange(50) / 10
+    values = np.zeros((50, channels))
+    figure = draw_sensor(felt(tuple(names), ("rad",) * channels, time, values))
+    drawn = [[line.get_label() for line in axis.lines] for axis in figure.axes]
+    assert [name for panel in drawn for name in panel] == names
+    assert len(drawn) == {2: 1, 26: 4, 64: 8}[channels]
+    for panel in drawn if channels == 26 else ():
+        assert len({name[:5] for name in panel}) == 1
+    for axis in figure.axes:
+        assert all(len(text.get_text()) < 26 for text in axis.get_legend().get_texts())
