@@ -52,7 +52,7 @@ def test_a_ranking_files_and_pictures(params: Path, capsys: pytest.CaptureFixtur
     report = params.parent / "report"
     assert sorted(file.name for file in report.iterdir()) == [MARKER, *FILES]
     # The action's first two channels are those of slot 0, which is the mean.
-    assert [line.split("  ")[0] for line in lines[6:11]] == [
+    assert [line.split("  ")[0] for line in lines[2:7]] == [
         "mean action",
         "past actions",
         "past actions + state",

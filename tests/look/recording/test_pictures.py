@@ -229,7 +229,8 @@ def test_many_channels_share_panels_of_few_and_no_name_is_long(felt: Felt, chann
     """A limb stays together: two arms of seven joints, two hands of six fingers."""
     arm = [f"{side}_joint_{number}" for side in ("left", "right") for number in range(7)]
     hand = [f"{side}_hand_thumb_rotation_{n}" for side in ("left", "right") for n in range(6)]
-    names = (arm + hand)[:channels] if channels < 27 else [f"joint_{n}" for n in range(channels)]
+    legs = [f"{leg}_{joint}" for leg in "stuvwxyz" for joint in "abcdefgh"]
+    names = (arm + hand if channels == 26 else legs)[:channels]
     time = np.arange(50) / 10
     values = np.zeros((50, channels))
     figure = draw_sensor(felt(tuple(names), ("rad",) * channels, time, values))
