@@ -57,6 +57,9 @@ def test_experiments_are_one_page(
     assert (executed.strong, chunk.strong) == ({0}, {1})
     assert len(executed.rows) == 2 + len(BASELINES)
     assert [tile[1] for tile in report.tiles][1::2] == ["regression-concat", "diffusion-concat"]
+    assert report.verdict.startswith("regression-concat errs least in what is executed, ")
+    assert report.verdict.endswith(("ahead of all others", "lead is not resolved"))
+    assert comparison_report(experiments[:1]).verdict == "regression-concat stands alone"
     write_report(tmp_path, report)
     assert_page_is_sound(tmp_path / PAGE)
 

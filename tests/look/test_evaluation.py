@@ -14,7 +14,7 @@ from pipeline.base.text import Table
 from pipeline.evaluate.ablation import evaluate_ablation
 from pipeline.evaluate.baselines import Baselines
 from pipeline.evaluate.evaluation import Evaluation, judged_document
-from pipeline.evaluate.figures import rivalry
+from pipeline.evaluate.figures import Figure, Rivalry, rivalry
 from pipeline.evaluate.sources import EpisodeFrames, TrainingCurve, TrainingCurves
 from pipeline.evaluate.tables import HEADINGS, ablation_table, error_table
 from pipeline.look import evaluation as evaluation_page
@@ -121,6 +121,29 @@ def test_tables_say_what_the_comparison_says(judgement: Evaluation) -> None:
     trained, spec, _, judged = report.blocks(Outline)
     assert trained.content["horizon"] == judged.content["on"]["horizon"] == 4
     assert spec.content["digest"] == "tiny-spec"
+
+
+@pytest.mark.parametrize(
+    ("policy", "low", "high", "verdict"),
+    [
+        (52.0, 40, 60, "the policy is 52 times worse than repeating the last action"),
+        (1.3, 0.1, 0.5, "the policy is 30% worse than repeating the last action"),
+        (0.25, -0.9, -0.6, "the policy errs 4 times less than repeating the last action"),
+        (1.3, -0.1, 0.5, "Not told apart from repeating the last action"),
+    ],
+)
+def test_the_verdict_is_a_sentence(
+    judgement: Evaluation, monkeypatch: pytest.MonkeyPatch, policy: float, low: float, high: float,
+    verdict: str,
+) -> None:  # fmt: skip
+    difference = Figure(policy - 1, low, high)
+    rivals = Rivalry(Figure(policy, None, None), "repeat_last", Figure(1.0, None, None), difference)
+    monkeypatch.setattr("pipeline.look.evaluation.rivalry", lambda part: rivals)
+    report = evaluation_report(judgement)
+    assert verdict in report.verdict
+    advice = " ".join(block.words for block in section(report, "What to do next").blocks)
+    assert ("docs/worse.md" in advice) == ("less" not in verdict)
+    assert "Hold out more" in advice and ("vla-cache rollout" in advice) == ("less" in verdict)
 
 
 def test_the_page_of_rollouts_is_linked_where_there_is_one(judgement: Evaluation) -> None:

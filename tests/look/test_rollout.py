@@ -96,9 +96,22 @@ def test_every_picture_is_there_and_the_page_is_sound(
     assert {file.stem for file in files} == {"report", "filmstrip_median", *ALWAYS}
     again = write_report(tmp_path / "again", rollout_report(rollouts))
     assert [file.read_bytes() for file in again] == [file.read_bytes() for file in files]
+    assert report.verdict == "The policy succeeds in 3 of 5 episodes"
+    advice = " ".join(block.words for block in report.sections[-1].blocks)
+    assert "features off" not in advice and "time is up (2)" in advice and "more demo" in advice
+    assert "rollout.episodes: 200" in advice and "drive" not in advice
     (settings,) = report.blocks(Outline)
     assert settings.content["chunking"] == "none"
     assert_page_is_sound(tmp_path / PAGE)
+
+
+def test_a_stream_that_does_not_help_is_named_and_a_good_policy_goes_on() -> None:
+    good = [rollout_episode(seed) for seed in range(200)]
+    blind = [rollout_episode(seed, controller="features off") for seed in range(200)]
+    advice = [
+        block.words for block in rollout_report(rollouts_of(*good, *blind)).sections[-1].blocks
+    ]
+    assert len(advice) == 2 and "features off" in advice[0] and "vla-cache drive" in advice[1]
 
 
 def test_several_latencies_are_drawn() -> None:

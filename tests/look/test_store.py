@@ -178,6 +178,8 @@ class TestIssues:
         assert view.issues[0].stream == "view View1"
         page = store_report(view)
         assert [row[-1] for row in blocks(page, "Coverage")[-1].rows[:2]] == ["no View1", "all"]
+        assert page.verdict == "1 finding to look at before training"
+        assert "verify" in blocks(page, "What to do next")[0].words
 
     def test_old_frames(self, path, plant):
         plant(path, "vl/frame_time", lambda shown: np.subtract(shown[:ROWS], 1, out=shown[:ROWS]))

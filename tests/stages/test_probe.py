@@ -59,6 +59,8 @@ def test_a_ranking_files_and_pictures(params: Path, capsys: pytest.CaptureFixtur
         "past actions + state + sensor",
         "layer 3, mean",
     ]
+    page = (report / "report.html").read_text()
+    assert "Keep layer 3, mean" in page and "What to do next" in page
     assert lines[-2].endswith("vlm: {layers: [3], norms: [true], pooling: [mean]}")
     assert sum("View1 cell" in line for line in lines) == 4
 
