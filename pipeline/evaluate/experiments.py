@@ -155,12 +155,12 @@ def experiment_table(experiments: Sequence[Experiment], span: str) -> Table:
         apart = experiment.minus(experiment, span, baseline)
         row = {
             "experiment": experiment.name,
-            "seeds": len(experiment.seeds),
-            "folds": experiment.folds,
             heading: experiment.error(span).text(),
-            "over seeds": f"{low:.3f} to {high:.3f}" if len(experiment.seeds) > 1 else None,
             "minus the best": _verdict(experiment.minus(best, span)),
             "minus the best baseline": f"{_verdict(apart)} ({HEADINGS[baseline]})",
+            "over seeds": f"{low:.3f} to {high:.3f}" if len(experiment.seeds) > 1 else None,
+            "seeds": len(experiment.seeds),
+            "folds": experiment.folds,
             "expert": policy.model_type,
             "fusion": policy.fusion_strategy,
             "samples": policy.samples,

@@ -127,8 +127,8 @@ def by_phase(comparison: Comparison) -> dict[str, Comparison]:
 
 
 def error_table(comparison: Comparison) -> Table:
-    """Mean absolute errors with their intervals, a row for each method."""
-    groups = (*comparison.groups, None)
+    """Mean absolute errors with their intervals, the overall one first, a row for each method."""
+    groups = (None, *comparison.groups)
     rows = [
         [HEADINGS[way], *(error(comparison, way, group).text() for group in groups)]
         for way in METHODS
@@ -143,9 +143,10 @@ def difference_table(comparison: Comparison) -> Table:
         for group in (*part.varying_groups(), None):
             rivals = rivalry(part, group)
             row = {"steps": scope.replace("_", " "), "error": _heading(group)}
+            row |= {"the policy is": rivals.verdict, "policy / best": rivals.ratio}
+            row |= {"policy minus best": rivals.difference.text("+")}
             row |= {"best baseline": HEADINGS[rivals.best], "its error": rivals.baseline.text()}
-            row |= {"policy minus it": rivals.difference.text("+"), "the policy is": rivals.verdict}
-            rows.append({**row, "policy / best": rivals.ratio})
+            rows.append(row)
     return Table.of(rows)
 
 
@@ -153,12 +154,12 @@ def phase_table(comparison: Comparison) -> Table:
     """Overall errors by phase, of the policy and of the baseline that is best there."""
     rows: list[dict[str, Any]] = []
     for phase, part in by_phase(comparison).items():
-        row: dict[str, Any] = {"phase": phase, "ticks": part.ticks}
+        row: dict[str, Any] = {"phase": phase}
         for scope, rivals in (("executed", rivalry(part.executed)), ("chunk", rivalry(part))):
+            row[f"{scope}: the policy is"] = rivals.verdict
             row[f"{scope}: policy"] = rivals.policy.text()
             row[f"{scope}: best baseline"] = f"{rivals.baseline.text()} {HEADINGS[rivals.best]}"
-            row[f"{scope}: the policy is"] = rivals.verdict
-        rows.append(row)
+        rows.append({**row, "ticks": part.ticks})
     return Table.of(rows)
 
 

@@ -51,9 +51,9 @@ def test_experiments_are_one_page(
     report = comparison_report(experiments)
     executed, chunk = report.blocks(Table)
     assert list(executed.columns[-4:]) == ["expert", "fusion", "samples", "parameters"]
-    assert executed.columns[3] == "what is executed [training std]"
-    assert chunk.columns[3] == "the whole chunk [training std]"
-    assert [row[1:3] for row in executed.rows[:2]] == [[1, 1], [2, 1]]
+    assert executed.columns[1] == "what is executed [training std]"
+    assert chunk.columns[1] == "the whole chunk [training std]"
+    assert [[*row[5:7]] for row in executed.rows[:2]] == [[1, 1], [2, 1]]
     assert (executed.strong, chunk.strong) == ({0}, {1})
     assert len(executed.rows) == 2 + len(BASELINES)
     assert [tile[1] for tile in report.tiles][1::2] == ["regression-concat", "diffusion-concat"]

@@ -107,8 +107,8 @@ def test_tables_say_what_the_comparison_says(judgement: Evaluation) -> None:
     assert executed.rows == error_table(comparison.executed).rows
     assert chunk.rows == error_table(comparison).rows
     assert [row[0] for row in differences.rows] == ["executed"] * 3 + ["chunk"] * 3
-    assert differences.rows[-1][-1] == rivalry(comparison).ratio
-    assert [row[:2] for row in phases.rows] == [["approach", 45], ["hold", 45]]
+    assert differences.rows[-1][3] == rivalry(comparison).ratio
+    assert [(row[0], row[-1]) for row in phases.rows] == [("approach", 45), ("hold", 45)]
     assert [row[0] for row in dimensions.rows] == list(comparison.names)
     assert dimensions.rows[1][2] == comparison.scores["policy"].mae[1]
     worst_first = sorted(comparison.overall_by_episode("policy"), reverse=True)
