@@ -171,7 +171,7 @@ class Case:
             paths = sorted(path for path in self.folder.rglob(pattern) if path.is_file())
             path = self.rng.choice(paths)
             act(path)
-            permits = permitted[0] if permitted else "plain" if what == "an AVI" else "refuse"
+            permits = permitted[0] if permitted else "any" if what == "an AVI" else "refuse"
             sound = self.subject.kind != "recordings" and what != "a terabyte"
             return Change(what, path, permits, sound=sound or bool(permitted))
         change = change_any(self.rng, self.place, self.corpus / "other" / self.subject.place)
@@ -199,8 +199,8 @@ class Case:
             return "code of the file was executed"
         try:
             return oracle.judge(self, change)
-        except Exception as error:  # whatever a plain reader stumbles over
-            return f"a plain reader refuses it: {type(error).__name__}: {error!s:.300}"
+        except Exception as error:
+            return f"its judge cannot read it: {type(error).__name__}: {error!s:.300}"
 
 
 def _seal(place: Path, path: Path) -> None:
