@@ -11,7 +11,7 @@ How it works:
 3. mutations.py has what chance does to a file, by the kind of file; hostile.py, what somebody would
    write on purpose. Each change says what may come of it where the command ends with 0.
 4. runner.py forks a process for each case from one that has imported everything, and limits it to
-   10 s and 2 GiB. The first cases of a class run as a user runs them instead, by the shell.
+   10 s and 2 GiB. A case of some classes runs as a user runs it instead, by the shell.
 5. oracle.py judges. After exit 0, what was read must be as before where the change permits nothing
    else. After exit 2, one message must name the file and say what to do. Whatever else happens is
    a failure.
