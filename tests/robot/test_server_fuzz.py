@@ -1,80 +1,82 @@
 """Broken messages cost their connection: the server goes on, and neither memory nor files grow."""
 
+import gc
 import os
 import re
 import signal
 import socket
 import struct
-import subprocess
-import sys
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass
+from multiprocessing.connection import Connection
+from multiprocessing.context import ForkServerContext
+from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any
 
 import msgpack
 import numpy as np
 import pytest
+import torch
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
+from pipeline.base.config import ServeParams
 from pipeline.robot import wire
 from pipeline.robot.client import PolicyClient
+from pipeline.robot.server import PolicyServer, listen
+from pipeline.robot.session import ServedPolicy
+from tests.robot.conftest import build_policy
 
-ROOT = Path(__file__).resolve().parents[2]
 GROWTH_MB = 24
 """Beyond what a server holds after its first messages."""
 
-SERVER = """
-import gc, runpy, signal, sys
-import torch
-from pipeline.base.config import ServeParams
-from pipeline.robot.server import PolicyServer, listen
-from pipeline.robot.session import ServedPolicy
 
-torch.set_num_threads(1)
-signal.signal(signal.SIGUSR1, lambda *_: print(gc.collect(), flush=True))
-checkpoint, policy, glance = runpy.run_path(sys.argv[1])["build_policy"]()
-glance.passes = type("Forgetful", (list,), {"append": lambda *_: None})()
-glance.instructions = glance.passes
-params = ServeParams(port=0, max_message_mb=1, max_connections=64)
-served = ServedPolicy(checkpoint, policy, glance, "head")
-server = PolicyServer(served, params, None, listen(params))
-server.run(lambda: print(server.address, flush=True))
-"""
+def serve(stderr: Path, told: Connection) -> None:
+    """Serve, tell where, and tell after each SIGUSR1 that garbage is collected."""
+    os.dup2(os.open(stderr, os.O_WRONLY | os.O_CREAT), 2)
+    torch.set_num_threads(1)
+    signal.signal(signal.SIGUSR1, lambda *_: told.send(gc.collect()))
+    checkpoint, policy, glance = build_policy()
+    nothing_kept: Any = type("Forgetful", (list,), {"append": lambda *_: None})()
+    glance.passes = glance.instructions = nothing_kept
+    params = ServeParams(port=0, max_message_mb=1, max_connections=64)
+    served = ServedPolicy(checkpoint, policy, glance, "head")
+    server = PolicyServer(served, params, None, listen(params))
+    server.run(lambda: told.send(server.address))
 
 
 @dataclass
 class Running:
     """A server in a process of its own."""
 
-    process: subprocess.Popen[str]
+    process: BaseProcess
+    heard: Connection
     address: str
 
     def held(self) -> tuple[float, int]:
         """Its memory in MB once garbage is collected, and its open files."""
-        self.process.send_signal(signal.SIGUSR1)
-        assert self.process.stdout is not None and self.process.stdout.readline()
+        assert self.process.pid is not None
+        os.kill(self.process.pid, signal.SIGUSR1)
+        self.heard.recv()
         place = Path("/proc") / str(self.process.pid)
         (kilobytes,) = re.findall(r"VmRSS:\s+(\d+) kB", (place / "status").read_text())
         return int(kilobytes) / 1000, len(os.listdir(place / "fd"))
 
 
 @pytest.fixture
-def running() -> Iterator[Running]:
-    script = [sys.executable, "-c", SERVER, str(Path(__file__).with_name("conftest.py"))]
-    environment = os.environ | {"PYTHONPATH": str(ROOT)}
-    pipe = subprocess.PIPE
-    process = subprocess.Popen(script, stdout=pipe, stderr=pipe, text=True, env=environment)
-    assert process.stdout is not None and process.stderr is not None
-    address = process.stdout.readline().strip()
-    assert address, process.stderr.read()
-    yield Running(process, address)
-    assert process.poll() is None, process.stderr.read()
-    process.send_signal(signal.SIGTERM)
-    _, error = process.communicate(timeout=30)
-    assert "Traceback" not in error, error
+def running(fork_server: ForkServerContext, tmp_path: Path) -> Iterator[Running]:
+    heard, told = fork_server.Pipe(duplex=False)
+    stderr = tmp_path / "stderr"
+    process = fork_server.Process(target=serve, args=(stderr, told))
+    process.start()
+    told.close()
+    yield Running(process, heard, heard.recv())
+    assert process.is_alive(), stderr.read_text()
+    process.terminate()
+    process.join(30)
+    assert not process.is_alive() and "Traceback" not in stderr.read_text()
 
 
 def wrong(rng: np.random.Generator) -> Any:
