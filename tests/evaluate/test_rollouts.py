@@ -57,8 +57,8 @@ def rollouts() -> Rollouts:
 
 @pytest.fixture(autouse=True)
 def brief(rollouts: Rollouts, monkeypatch: pytest.MonkeyPatch) -> None:
-    """But for `rollouts`, an episode ends after 3 s."""
-    monkeypatch.setattr("pipeline.simulation.insertion.MAX_TICKS", 30)
+    """But for `rollouts`, an episode ends after 2 s."""
+    monkeypatch.setattr("pipeline.simulation.insertion.MAX_TICKS", 20)
 
 
 def test_every_controller_meets_the_same_episodes(rollouts: Rollouts) -> None:
