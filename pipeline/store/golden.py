@@ -21,7 +21,7 @@ from zarr.codecs import BytesCodec, Crc32cCodec, ZstdCodec
 from pipeline.base.errors import Issue, StoreIncomplete
 from pipeline.base.files import disk_full_named, sync
 from pipeline.base.source import row_key
-from pipeline.store.border import FrameDocument, Group, StoreAttributes, StoredGolden, store_border
+from pipeline.store.border import FrameDocument, StoreAttributes, StoredGolden, store_border
 from pipeline.store.chunks import check_metadata, note_metadata, read_rows
 from pipeline.store.paths import group_attributes, laid_out_attributes
 from pipeline.store.schema import TRAILER_BYTES, ArraySpec
@@ -106,7 +106,7 @@ def golden_issues(
     # Golden rows are read without the groups, but zarr finds them by these alone.
     for place in _groups(root, attributes):
         try:
-            store_border(root).read_json(place / "zarr.json", Group)
+            store_border(root).check_file(place / "zarr.json")
         except StoreIncomplete as error:
             yield Issue(severity="error", kind="golden row", message=str(error), stream=GOLDEN)
 
