@@ -81,7 +81,6 @@ from pipeline.store.chunks import ChunkFiles, read_rows, row_checksums, write_se
 from pipeline.store.golden import GoldenFrames, write_golden
 from pipeline.store.paths import read_attributes
 from pipeline.store.schema import read_specs
-from pipeline.vlm.demo_checkpoint import write_demo_checkpoint
 
 # A shell that runs tests in the background has them ignore Ctrl-C, and so would every process that
 # they start to see it stop.
@@ -417,6 +416,9 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
 @pytest.fixture(scope="session")
 def demo_checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The small Qwen2.5-VL of the demo."""
+    # transformers takes seconds to import, which most tests do without.
+    from pipeline.vlm.demo_checkpoint import write_demo_checkpoint
+
     folder = tmp_path_factory.mktemp("checkpoint") / "demo_vlm"
     write_demo_checkpoint(folder)
     return folder

@@ -1,4 +1,7 @@
-"""What re-runs when what changes: the pipeline in a copy of the project, with tiny params."""
+"""What re-runs when what changes: the pipeline in a copy of the project, with tiny params.
+
+Whole runs are slow ones: `.ci/run` has `dvc repro` twice, as the README types it.
+"""
 
 import json
 import os
@@ -12,6 +15,7 @@ from pathlib import Path
 import pytest
 import yaml
 
+from pipeline.base.config import load_params
 from pipeline.store import FeatureStore
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -79,13 +83,19 @@ class Project:
         ).stdout
 
 
+def copied(folder: Path) -> Project:
+    """A copy of the project with tiny params."""
+    if shutil.which("git") is None or not (ROOT / ".git").exists():
+        pytest.skip("needs git and the project's own repository")
+    made = Project(folder)
+    made.set(**TINY)
+    return made
+
+
 @pytest.fixture(scope="module")
 def reproduced(tmp_path_factory: pytest.TempPathFactory) -> Project:
     """The project after one `dvc repro`."""
-    if shutil.which("git") is None or not (ROOT / ".git").exists():
-        pytest.skip("needs git and the project's own repository")
-    made = Project(tmp_path_factory.mktemp("project"))
-    made.set(**TINY)
+    made = copied(tmp_path_factory.mktemp("project"))
     made.dvc("repro")
     return made
 
@@ -114,21 +124,14 @@ def test_no_other_pipeline_claims_outputs():
     assert tracked.split() in ([], ["dvc.yaml"])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("stage", "values"),
     [
         ("evaluate", {"evaluate": {"output": "notes"}}),
-        pytest.param("train_head", {"train_head": {"output": "notes"}}, marks=pytest.mark.slow),
-        pytest.param(
-            "demo",
-            {"demo": {"recordings": "notes", "checkpoint": "notes"}},
-            marks=pytest.mark.slow,
-        ),
-        pytest.param(
-            "rollout",
-            {"rollout": {"output": "notes", "environment": None}},
-            marks=pytest.mark.slow,
-        ),
+        ("train_head", {"train_head": {"output": "notes"}}),
+        ("demo", {"demo": {"recordings": "notes", "checkpoint": "notes"}}),
+        ("rollout", {"rollout": {"output": "notes", "environment": None}}),
     ],
 )
 def test_a_folder_of_the_user_survives_a_param_that_names_it(project, stage, values):
@@ -143,6 +146,7 @@ def test_a_folder_of_the_user_survives_a_param_that_names_it(project, stage, val
         shutil.rmtree(thesis.parent)
 
 
+@pytest.mark.slow
 def test_code_that_changed_trains_a_finished_run_again(project):
     shown = project.dvc("repro", "-f", "-s", "train_head")
     assert "holds this very run; it is replaced" in shown
@@ -156,11 +160,13 @@ def test_what_is_judged_is_what_was_trained():
     assert yaml.safe_load((ROOT / "params.yaml").read_text())["evaluate"]["checkpoint"] is None
 
 
+@pytest.mark.slow
 def test_a_second_run_does_nothing(project):
     assert project.stale() == {}  # says what changed, where something did
     assert "Data and pipelines are up to date." in project.dvc("repro")
 
 
+@pytest.mark.slow
 def test_metrics_and_plots_are_declared(project):
     shown = json.loads(project.dvc("metrics", "show", "--json"))
     evaluated, rolled_out = (
@@ -173,7 +179,16 @@ def test_metrics_and_plots_are_declared(project):
     assert (project.folder / "reports/evaluate/scatter.png").exists()
 
 
-def test_a_param_makes_its_own_stage_stale_and_none_before(project):
+def test_a_param_makes_its_own_stage_stale_and_none_before(tmp_path):
+    """Of what lies there DVC asks only whether it changed: files of any content stand for it."""
+    project = copied(tmp_path)
+    document = yaml.safe_load((project.folder / "dvc.yaml").read_text())["stages"]
+    params = load_params(project.folder / "params.yaml").model_dump()
+    for out in (next(iter(out)) for stage in document.values() for out in stage["outs"]):
+        named = re.sub(r"\$\{(\w+)\.(\w+)\}", lambda m: str(params[m[1]][m[2]]), out)
+        (project.folder / named).mkdir(parents=True, exist_ok=True)
+        (project.folder / named / "made").write_text(named)
+    project.dvc("commit", "--force")
     project.set(extract={"batch_size": 3, "decode_threads": 1})
     assert project.stale() == {}
     project.set(
@@ -195,6 +210,7 @@ def test_a_param_makes_its_own_stage_stale_and_none_before(project):
     }
 
 
+@pytest.mark.slow
 def test_own_data_leave_the_demo_alone_and_an_added_episode_computes_its_rows(project, tmp_path):
     own = tmp_path / "own"
     shutil.copytree(project.folder / "data/demo/raw", own / "task" / "raw")

@@ -19,6 +19,7 @@ FIRST = """import sys, warnings
 warnings.simplefilter("error")
 print(sys.executable)"""
 PICTURES_A_RECORDING = 5
+SOURCES = ("raw", "lerobot")
 
 
 def read() -> NotebookNode:
@@ -37,20 +38,21 @@ class Shown:
 def shown(demo_checkpoint, tmp_path_factory: pytest.TempPathFactory) -> Shown:
     """The outputs of all cells, run by this very Python in a folder of a project.
 
-    One kernel runs them on the demo, of an episode a format, and then again on a path. Every
+    One kernel runs them on the demo, of an episode of two formats, and then on a path. Every
     warning of the project's code is an error there, as it is in tests.
     """
     folder = tmp_path_factory.mktemp("project")
     (folder / "notebooks").mkdir()
     (folder / "models").mkdir()
     params = yaml.safe_load((ROOT / "params.yaml").read_text(encoding="utf-8"))
-    params["inspect"] = {"samples": 2, "ticks": 2}
+    params["inspect"] = {"samples": 1, "ticks": 1}
+    params["data"]["sources"] = [{"name": name, "path": name} for name in SOURCES]
     (folder / "params.yaml").write_text(yaml.safe_dump(params), encoding="utf-8")
     (folder / "models" / "demo_vlm").symlink_to(demo_checkpoint)
     write_demo_recordings(folder / "data" / "demo", 1, 0)
 
     own = read().cells
-    path = str(folder / "data" / "demo" / "new")
+    path = str(folder / "data" / "demo" / "old")
     own.insert(0, nbformat.v4.new_code_cell(f"os.environ['RECORDINGS'] = {path!r}"))
     notebook = read()
     notebook.cells.insert(0, nbformat.v4.new_code_cell(FIRST))
@@ -88,18 +90,18 @@ def test_it_is_kept_without_outputs():
     assert notebook.metadata == {"language_info": {"name": "python"}}
 
 
-def test_it_shows_every_format_of_the_demo(shown):
+def test_it_shows_every_source_of_the_demo(shown):
     text = said(shown.demo)
     assert text.splitlines()[0] == sys.executable
-    for source in ("raw", "new", "old", "lerobot"):
+    for source in SOURCES:
         assert f"\n{source}: " in text
     assert "<|vision_start|>" in text and "<|im_end|>" in text and "image tokens" in text
-    assert len(pictures(shown.demo)) == 4 * PICTURES_A_RECORDING
+    assert len(pictures(shown.demo)) == len(SOURCES) * PICTURES_A_RECORDING
     assert said(shown.demo, "stderr") == ""
 
 
 def test_it_shows_a_path_of_the_users(shown):
     text = said(shown.own)
-    assert "\nnew: " in text and "\nraw: " not in text
+    assert "\nold: " in text and "\nraw: " not in text
     assert len(pictures(shown.own)) == PICTURES_A_RECORDING
     assert said(shown.own, "stderr") == ""

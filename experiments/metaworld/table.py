@@ -96,7 +96,7 @@ def write_tables(run: Run) -> Path:
     tables = [success_table(name, own) for name, own in by_variant.items()]
     beside = Table(("encoder", "best"), list(PUBLISHED.items()), "CortexBench, published")
     for table in tables:
-        print(table.title, *table.text(), sep="\n")
+        print(table.caption, *table.text(), sep="\n")
     figures = {name: {row[0]: row[1:] for row in t.rows} for name, t in zip(by_variant, tables)}  # noqa: B905
     content = {"published": PUBLISHED, "episodes": run.episodes, "variants": figures}
     (run.out / "tables.json").write_text(json.dumps(content, indent=1), encoding="utf-8")

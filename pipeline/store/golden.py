@@ -103,15 +103,25 @@ def golden_issues(
             _read(root, attributes, number, key)
         except StoreIncomplete as error:
             yield Issue(severity="error", kind="golden row", message=str(error), stream=GOLDEN)
+    # Golden rows are read without the groups, but zarr finds them by these alone.
+    for place in _groups(root, attributes):
+        try:
+            store_border(root).check_file(place / "zarr.json")
+        except StoreIncomplete as error:
+            yield Issue(severity="error", kind="golden row", message=str(error), stream=GOLDEN)
+
+
+def _groups(root: Path, attributes: StoreAttributes) -> list[Path]:
+    """The zarr groups of the golden rows that the root attributes list."""
+    rows = [root / GOLDEN / str(number) for number in range(len(attributes.golden))]
+    return [root / GOLDEN, *rows] if "golden" in attributes.model_fields_set else []
 
 
 def golden_files(root: Path, attributes: StoreAttributes) -> set[Path]:
     """The files of the golden rows that the root attributes list."""
-    groups = [root / GOLDEN] * ("golden" in attributes.model_fields_set)
-    frames: list[Path] = []
-    for number, entry in enumerate(attributes.golden):
-        groups.append(root / GOLDEN / str(number))
-        frames += [groups[-1] / view for view in entry.views]
+    groups = _groups(root, attributes)
+    rows = zip(groups[1:], attributes.golden, strict=True)
+    frames = [place / view for place, entry in rows for view in entry.views]
     chunks = {frame / "c" / "0" / "0" / "0" for frame in frames}
     return chunks | {place / "zarr.json" for place in (*groups, *frames)}
 

@@ -477,11 +477,12 @@ def test_aliases_build_the_right_thing(
 
 
 def test_cached_features_need_no_transformers() -> None:
+    """Nor do the data sets and models of stage two."""
     code = """
 import sys
 sys.modules["transformers"] = sys.modules["peft"] = None
-import torch
-from pipeline.models import QwenVLAUnified
+import pipeline.datasets, torch
+from pipeline.models import Policy, QwenVLAUnified
 model = QwenVLAUnified(sensor_encoder={"channels": [8], "heads": 1, "output_dim": 8})
 assert model.eval()(features=torch.randn(2, 1, 2048)).shape == (2, 8, 7)
 """

@@ -104,7 +104,7 @@ def trained_store(tiny_store: Make, tmp_path_factory: pytest.TempPathFactory) ->
 
 @pytest.fixture(scope="module")
 def study(trained_store: FeatureStore) -> AblationStudy:
-    found = studied(trained_store, steps=200)
+    found = studied(trained_store, steps=120)
     assert found is not None
     return found
 

@@ -18,7 +18,8 @@ from pipeline.policy.observation import PolicyShape
 from pipeline.policy.policy import Policy
 from pipeline.simulation.environments import environment_maker
 from pipeline.simulation.interface import RobotEnvironment
-from tests.evaluate.test_rollouts import DIM, SLOTS, Glance, made
+from tests.robot.conftest import DIM, SLOTS, Glance
+from tests.robot.conftest import build_policy as made
 from tests.simulation.environment_contract import EnvironmentContract
 
 RECIPE = Path(__file__).parents[2] / "docs" / "recipes" / "environment.md"
@@ -87,7 +88,7 @@ def test_success_reasons_and_frames_are_the_environments_own() -> None:
     assert rollouts.controllers == ("policy", "features off")  # it has no demonstrator
     assert [e.success for e in episodes] == [True] * 3
     assert {(e.level, e.reason, e.trace) for e in episodes} == {("slide", "succeeded", None)}
-    assert glance.instructions == {TASK} == {rollouts.settings["instruction"]}
+    assert {*glance.instructions} == {TASK} == {rollouts.settings["instruction"]}
     head = rollouts.table(policy=True).csv().splitlines()[0]
     assert head == "seed,level,success,reason,time_s,ticks"
     for episode in episodes:

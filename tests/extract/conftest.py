@@ -1,7 +1,9 @@
 """Small recordings in the windowed format, params that extract them, processes that do."""
 
 import json
+import os
 import shutil
+import signal
 import subprocess
 import sys
 import time
@@ -261,6 +263,12 @@ class Process:
         if self._code is None:
             self._code = self._ask(poll=self.pid)
         return self._code
+
+    def kill(self) -> None:
+        """SIGKILL, and wait for its end."""
+        if self.poll() is None:
+            os.kill(self.pid, signal.SIGKILL)
+            self.wait()
 
     def wait(self) -> int:
         """Its exit code, once it has ended."""

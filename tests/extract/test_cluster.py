@@ -7,8 +7,6 @@ import os
 import pickle
 import re
 import signal
-import subprocess
-import sys
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -38,7 +36,7 @@ from pipeline.extract.cluster import ExtractionPlugin, check_scheduler, connecte
 from pipeline.extract.survey import Survey, survey
 from pipeline.store import FeatureStore, RowSource, StoreBuild, part_path
 from pipeline.vlm.feature_spec import feature_spec
-from tests.extract.conftest import assert_same, missing_of, run
+from tests.extract.conftest import Process, assert_same, missing_of, run
 
 BATCH = 4
 PATIENCE_S = 200
@@ -272,9 +270,9 @@ class TestDeaths:
         assert 1 <= times.total() - len(times) <= BATCH
 
     @pytest.mark.slow
-    def test_a_worker_that_joins_later_takes_part(self, changed, workers, here, monkeypatch):
+    def test_a_worker_that_joins_later_takes_part(self, changed, workers, here, monkeypatch, begun):
         mark = StoreBuild.mark
-        joined: list[subprocess.Popen[bytes]] = []
+        joined: list[Process] = []
 
         def joined_after_first(self, *args):
             if not joined:
@@ -293,7 +291,6 @@ class TestDeaths:
         finally:
             for process in joined:
                 process.kill()
-                process.wait()
         assert_same(FeatureStore.open(params.extract.store), here)
         assert len(workers.computed()[1]) == 3
 
@@ -407,7 +404,7 @@ class TestRefusals:
 
 class TestScheduler:
     def test_a_killed_scheduler_is_said_and_the_next_run_completes(
-        self, changed, here, tmp_path, monkeypatch
+        self, changed, here, tmp_path, monkeypatch, begun
     ):
         address_file = tmp_path / "scheduler.json"
         options = ["--scheduler-file", str(address_file)]
@@ -432,7 +429,6 @@ class TestScheduler:
         finally:
             for process in (scheduler, worker):
                 process.kill()
-                process.wait()
         monkeypatch.setattr(StoreBuild, "mark", mark)
         everything = set(range(len(here.array("vl/time"))))
         assert missing_of(params.extract.store) == everything - set(marked)
@@ -556,13 +552,14 @@ TWO = ("--set", "extract.workers=2")
 WORKER = ("--nthreads", "2", "--no-nanny", "--death-timeout", "60", "--no-dashboard")
 
 
-def begun(role: str, *options: str) -> "subprocess.Popen[bytes]":
-    """A process of dask's command line."""
-    return subprocess.Popen(
-        [sys.executable, "-m", f"distributed.cli.dask_{role}", *options],
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-    )
+@pytest.fixture
+def begun(begin: Callable[..., Process], tmp_path: Path) -> Callable[..., Process]:
+    """`begun(role, ...)`: a process of dask's command line."""
+
+    def begin_role(role: str, *options: str) -> Process:
+        return begin(f"from distributed.cli.dask_{role} import main\nmain()", tmp_path, *options)
+
+    return begin_role
 
 
 def wait_for(true: Callable[[], bool], process) -> None:

@@ -72,14 +72,21 @@ def test_extract(document, small_disk: Path, full_then_free, params: Path, leave
 
 
 def test_train_and_evaluate(
-    tiny_store: Callable[..., Path], head_params, small_disk: Path, full_then_free, tmp_path: Path
+    tiny_store: Callable[..., Path],
+    head_params,
+    small_disk: Path,
+    full_then_free,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    # Of this process, which has room: most of the time goes into pictures.
+    monkeypatch.setattr("pipeline.look.page.writing.write_report", lambda *_: [])
     store = tiny_store(tmp_path)
     output, report = small_disk / "head", small_disk / "report"
     params = head_params(
         store,
         train_head={"output": str(output), "max_steps": 8},
-        evaluate={"checkpoint": str(output), "output": str(report)},
+        evaluate={"checkpoint": str(output), "output": str(report), "modalities": False},
     )
     full_then_free(20_000, "stages.train_head", params)
     assert (output / "best" / "policy.json").exists()

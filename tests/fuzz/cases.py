@@ -60,8 +60,8 @@ TURN = (["recordings"] * 9 + ["VLM folders"] * 2 + ["adapters"] * 2 + ["stores"]
 )
 """The classes of the cases, over and over."""
 CLASSES = tuple(dict.fromkeys(TURN))
-_BY_SHELL = {"archives": 5, "recordings": 1, "stores": 1, "trained heads": 1}
-"""How many cases of a class, its first, run as a user runs them: a dozen, which takes seconds."""
+_BY_SHELL = ("archives", "recordings", "stores", "trained heads")
+"""Classes of which a case, in the second turn, runs as a user runs it, which takes seconds."""
 
 
 @dataclass(frozen=True)
@@ -113,7 +113,8 @@ class Case:
     @property
     def by_shell(self) -> bool:
         """Whether the command runs as a user runs it."""
-        return not self.whole and self.turn < _BY_SHELL.get(self.kind, 0)
+        second = self.turn == TURN.count(self.kind)
+        return not self.whole and second and self.kind in _BY_SHELL
 
     @cached_property
     def stage(self) -> str:
@@ -171,7 +172,7 @@ class Case:
             paths = sorted(path for path in self.folder.rglob(pattern) if path.is_file())
             path = self.rng.choice(paths)
             act(path)
-            permits = permitted[0] if permitted else "plain" if what == "an AVI" else "refuse"
+            permits = permitted[0] if permitted else "any" if what == "an AVI" else "refuse"
             sound = self.subject.kind != "recordings" and what != "a terabyte"
             return Change(what, path, permits, sound=sound or bool(permitted))
         change = change_any(self.rng, self.place, self.corpus / "other" / self.subject.place)
@@ -199,8 +200,8 @@ class Case:
             return "code of the file was executed"
         try:
             return oracle.judge(self, change)
-        except Exception as error:  # whatever a plain reader stumbles over
-            return f"a plain reader refuses it: {type(error).__name__}: {error!s:.300}"
+        except Exception as error:
+            return f"its judge cannot read it: {type(error).__name__}: {error!s:.300}"
 
 
 def _seal(place: Path, path: Path) -> None:

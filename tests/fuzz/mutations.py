@@ -22,10 +22,10 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from PIL import Image
 
-Permit = Literal["same", "plain", "type", "refuse"]
-"""What exit 0 may give after a change. `same`: what it gave before. `plain`: what a plain reader
-finds. `type`: likewise, but nothing may take the strange type for the right one. `refuse`: what it
-gave before, which only a file gives that nobody opens."""
+Permit = Literal["same", "any", "type", "refuse"]
+"""What exit 0 may give after a change. `same`: what it gave before. `any`: what stands there now.
+`type`: likewise, but nothing may take the strange type for the right one. `refuse`: what it gave
+before, which only a file gives that nobody opens."""
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ class Change:
 
     what: str
     path: Path
-    permits: Permit = "plain"
+    permits: Permit = "any"
     key: str = ""
     """Its place in a document."""
     sound: bool = False
@@ -48,7 +48,7 @@ class Edited(NamedTuple):
 
     data: bytes
     what: str
-    permits: Permit = "plain"
+    permits: Permit = "any"
     key: str = ""
     sound: bool = True
 
@@ -81,7 +81,7 @@ def edit_document(rng: Random, data: bytes) -> Edited:
     name = rng.choice(list(VALUES))
     if parent is None:
         return Edited(_encoded(VALUES[name]), f"the whole is {name}", "type", sound=False)
-    permits, other, twin = "plain", _key(rng, parent), '"twin"'
+    permits, other, twin = "any", _key(rng, parent), '"twin"'
     match rng.choice(["value"] * 6 + ["drop", "unknown", "twice", "swap"]):
         case "value":
             permits, what = _permits(parent[key], VALUES[name]), f"is {name}"
@@ -129,14 +129,14 @@ def _place(rng: Random, document: Any) -> tuple[Any, Any, str]:
 
 
 def _permits(old: Any, new: str) -> Permit:
-    """`plain` where the value is of the old one's type, or says that there is none."""
+    """`any` where the value is of the old one's type, or says that there is none."""
     try:
         value = json.loads(new)
     except (ValueError, RecursionError):
         return "type"
     numbers = (int, float)
     alike = type(value) is type(old) or (type(value) in numbers and type(old) in numbers)
-    return "plain" if value is None or old is None or alike else "type"
+    return "any" if value is None or old is None or alike else "type"
 
 
 def edit_lines(rng: Random, data: bytes) -> Edited:
@@ -239,7 +239,7 @@ def edit_npz(rng: Random, data: bytes) -> Edited:
     """A member of another shape, type or content, or one too many or too few."""
     with np.load(io.BytesIO(data)) as archive:
         members = dict(archive)
-    name, permits, buffer = rng.choice(list(members)), "plain", io.BytesIO()
+    name, permits, buffer = rng.choice(list(members)), "any", io.BytesIO()
     match rng.choice(["array"] * 6 + ["drop", "more", "rename", "single"]):
         case "array":
             members[name], what = _other_array(rng, members[name])
@@ -265,7 +265,7 @@ def edit_pickle(rng: Random, data: bytes) -> Edited:
     parent, key, where = _place(rng, document)
     while isinstance(parent, list) and rng.random() < 0.7:  # most places are paths of frames
         parent, key, where = _place(rng, document)
-    protocol, permits = rng.randrange(6), "plain"
+    protocol, permits = rng.randrange(6), "any"
     what = f"and all in protocol {protocol}"
     act = rng.choice(["value"] * 6 + ["protocol", "drop"])
     if act == "drop":
@@ -473,7 +473,7 @@ def change_file(rng: Random, path: Path, others: list[Path]) -> Change:
     path.unlink()
     FILES[name](path)
     gone = name in ("missing", "a link to nothing", "a link to itself")
-    return Change(name, path, "plain" if gone else "refuse", sound=gone)
+    return Change(name, path, "any" if gone else "refuse", sound=gone)
 
 
 KINDS: dict[str, Callable[[Random, bytes], Edited]] = {
@@ -510,7 +510,7 @@ def change_any(rng: Random, root: Path, other: Path) -> Change:
     edits = BYTES | TEXT if text else BYTES
     name = rng.choice(list(edits))
     rewrite(path, edits[name](rng, path.read_bytes()))
-    return Change(name, path, "same" if name in HARMLESS else "plain")
+    return Change(name, path, "same" if name in HARMLESS else "any")
 
 
 def rewrite(path: Path, data: bytes) -> None:

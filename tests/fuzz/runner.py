@@ -163,7 +163,7 @@ def _in_child(case: Case, write: int) -> None:
         sys.stderr.flush()
         peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 - before
         os.write(write, pickle.dumps(("ran", (code, peak))))
-        _limit(3 * case.seconds)  # its judge reads plainly
+        _limit(3 * case.seconds)
         if code == 0:
             os.dup2(silent, 2)
             os.write(write, pickle.dumps(("judged", case.judge(change))))

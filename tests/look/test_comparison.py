@@ -45,9 +45,15 @@ def experiments() -> list[Experiment]:
     ]
 
 
-def test_experiments_are_one_page(
+@pytest.mark.slow
+def test_the_page_is_sound(
     experiments: list[Experiment], tmp_path: Path, assert_page_is_sound: Callable[[Path], None]
 ) -> None:
+    write_report(tmp_path, comparison_report(experiments))
+    assert_page_is_sound(tmp_path / PAGE)
+
+
+def test_experiments_are_one_page(experiments: list[Experiment]) -> None:
     report = comparison_report(experiments)
     executed, chunk = report.blocks(Table)
     assert list(executed.columns[-4:]) == ["expert", "fusion", "samples", "parameters"]
@@ -60,8 +66,6 @@ def test_experiments_are_one_page(
     assert report.verdict.startswith("regression-concat errs least in what is executed, ")
     assert report.verdict.endswith(("ahead of all others", "lead is not resolved"))
     assert comparison_report(experiments[:1]).verdict == "regression-concat stands alone"
-    write_report(tmp_path, report)
-    assert_page_is_sound(tmp_path / PAGE)
 
 
 def test_bars_have_whiskers_and_seeds_are_dots(experiments: list[Experiment]) -> None:

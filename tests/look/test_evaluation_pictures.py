@@ -89,15 +89,6 @@ def test_every_picture_is_written(
     assert len(files) == 5 and all(file.stat().st_size > 5000 for file in files)
 
 
-def test_the_same_numbers_are_the_same_bytes(tmp_path: Path) -> None:
-    written = []
-    for name in ("one", "two"):
-        (tmp_path / name).mkdir()
-        files = write(tmp_path / name, pictures(*evaluated(1)))
-        written.append([file.read_bytes() for file in files])
-    assert written[0] == written[1]
-
-
 def test_whole_chunks_are_drawn_at_their_instants_with_and_without_frames() -> None:
     comparison, predictions, store = evaluated(2)
     figure = pictures(comparison, predictions, store)["chunks.png"]()

@@ -281,6 +281,7 @@ def test_what_looks_wrong_is_named_with_its_episode(report, doubled):
     assert json.dumps(spec.content) == json.dumps(doubled.store.spec)
 
 
+@pytest.mark.slow
 def test_the_page_loads(report, tmp_path, assert_page_is_sound):
     page, *beside = write_report(tmp_path / "page", report)
     assert {one.name for one in beside} == {"norms.png", "findings.csv"}

@@ -80,8 +80,9 @@ class Glance:
 
 
 def build_policy(
-    model_type: str = "regression", **changed: Any
+    model_type: str = "regression", views: int = len(VIEWS), **changed: Any
 ) -> tuple[PolicyCheckpoint, Policy, Glance]:
+    """A policy of few random weights for the phantom, its checkpoint, a stand-in for its model."""
     params = TrainHeadParams.model_validate(
         {
             "model_type": model_type,
@@ -94,7 +95,7 @@ def build_policy(
         }
         | changed
     )
-    shape = PolicyShape(SLOTS, DIM, 1026, 12, 7, GROUPS, views=len(VIEWS))
+    shape = PolicyShape(SLOTS, DIM, 1026, 12, 7, GROUPS, views=views)
     normal = no_normalization(shape)
     # So that a random policy moves by tenths of a millimetre.
     action = replace(normal.action, std=np.full(7, 0.05), mean=np.array([0, 0, -0.1, 0, 0, 0, 1.0]))

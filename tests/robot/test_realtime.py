@@ -442,7 +442,6 @@ def test_a_server_that_stays_busy_stops_the_robot() -> None:
     stopped(Arm(), StopKind.NO_CHUNK, "used up", Brain(busy))
 
 
-@pytest.mark.parametrize("stream", ["state", "sensor"])
 def without_sensor(observed: Observed) -> None:
     observed["sensor_time"] = observed["sensor"] = []
 

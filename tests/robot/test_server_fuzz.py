@@ -1,145 +1,106 @@
 """Broken messages cost their connection: the server goes on, and neither memory nor files grow."""
 
+import gc
 import os
 import re
 import signal
 import socket
 import struct
-import subprocess
-import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass
+from multiprocessing.connection import Connection
+from multiprocessing.context import ForkServerContext
+from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any
 
 import msgpack
 import numpy as np
 import pytest
+import torch
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
+from pipeline.base.config import ServeParams
 from pipeline.robot import wire
 from pipeline.robot.client import PolicyClient
+from pipeline.robot.server import PolicyServer, listen
+from pipeline.robot.session import ServedPolicy
+from tests.robot.conftest import build_policy
 
-ROOT = Path(__file__).resolve().parents[2]
 GROWTH_MB = 24
 """Beyond what a server holds after its first messages."""
 
-SERVER = """
-import gc, runpy, signal, sys
-import torch
-from pipeline.base.config import ServeParams
-from pipeline.robot.server import PolicyServer, listen
-from pipeline.robot.session import ServedPolicy
 
-torch.set_num_threads(1)
-signal.signal(signal.SIGUSR1, lambda *_: print(gc.collect(), flush=True))
-checkpoint, policy, glance = runpy.run_path(sys.argv[1])["build_policy"]()
-glance.passes = type("Forgetful", (list,), {"append": lambda *_: None})()
-glance.instructions = glance.passes
-params = ServeParams(port=0, max_message_mb=1, max_connections=64)
-served = ServedPolicy(checkpoint, policy, glance, "head")
-server = PolicyServer(served, params, None, listen(params))
-server.run(lambda: print(server.address, flush=True))
-"""
+def serve(stderr: Path, told: Connection) -> None:
+    """Serve, tell where, and tell after each SIGUSR1 that garbage is collected."""
+    os.dup2(os.open(stderr, os.O_WRONLY | os.O_CREAT), 2)
+    torch.set_num_threads(1)
+    signal.signal(signal.SIGUSR1, lambda *_: told.send(gc.collect()))
+    checkpoint, policy, glance = build_policy()
+    nothing_kept: Any = type("Forgetful", (list,), {"append": lambda *_: None})()
+    glance.passes = glance.instructions = nothing_kept
+    params = ServeParams(port=0, max_message_mb=1, max_connections=64)
+    served = ServedPolicy(checkpoint, policy, glance, "head")
+    server = PolicyServer(served, params, None, listen(params))
+    server.run(lambda: told.send(server.address))
 
 
 @dataclass
 class Running:
     """A server in a process of its own."""
 
-    process: subprocess.Popen[str]
+    process: BaseProcess
+    heard: Connection
     address: str
 
     def held(self) -> tuple[float, int]:
         """Its memory in MB once garbage is collected, and its open files."""
-        self.process.send_signal(signal.SIGUSR1)
-        assert self.process.stdout is not None and self.process.stdout.readline()
+        assert self.process.pid is not None
+        os.kill(self.process.pid, signal.SIGUSR1)
+        self.heard.recv()
         place = Path("/proc") / str(self.process.pid)
         (kilobytes,) = re.findall(r"VmRSS:\s+(\d+) kB", (place / "status").read_text())
         return int(kilobytes) / 1000, len(os.listdir(place / "fd"))
 
 
 @pytest.fixture
-def running() -> Iterator[Running]:
-    script = [sys.executable, "-c", SERVER, str(Path(__file__).with_name("conftest.py"))]
-    environment = os.environ | {"PYTHONPATH": str(ROOT)}
-    pipe = subprocess.PIPE
-    process = subprocess.Popen(script, stdout=pipe, stderr=pipe, text=True, env=environment)
-    assert process.stdout is not None and process.stderr is not None
-    address = process.stdout.readline().strip()
-    assert address, process.stderr.read()
-    yield Running(process, address)
-    assert process.poll() is None, process.stderr.read()
-    process.send_signal(signal.SIGTERM)
-    _, error = process.communicate(timeout=30)
-    assert "Traceback" not in error, error
+def running(fork_server: ForkServerContext, tmp_path: Path) -> Iterator[Running]:
+    heard, told = fork_server.Pipe(duplex=False)
+    stderr = tmp_path / "stderr"
+    process = fork_server.Process(target=serve, args=(stderr, told))
+    process.start()
+    told.close()
+    yield Running(process, heard, heard.recv())
+    assert process.is_alive(), stderr.read_text()
+    process.terminate()
+    process.join(30)
+    assert not process.is_alive() and "Traceback" not in stderr.read_text()
 
 
-def array_of(rng: np.random.Generator) -> Any:
-    """An array as a message describes it, wrong in some way."""
-    dtype = rng.choice(["|O", "<U4", "<c8", "<f4", "f4,f4", "S9999999999", "<f16", "x", "<i8"])
-    sizes = [0, 1, 3, 12, 2**31, 2**62, -1, 2**63 - 1]
-    shape = [int(rng.choice(sizes)) for _ in range(rng.integers(0, 12))]
-    data = rng.bytes(int(rng.choice([0, 4, 48, 5000])))
-    return {b"__ndarray__": True, b"dtype": str(dtype), b"shape": shape, b"data": data}
+def wrong(rng: np.random.Generator) -> Any:
+    """What no field may hold, or not this one."""
+    array = {b"__ndarray__": True, b"dtype": "<f4", b"shape": [2**31, 2**62], b"data": b"0000"}
+    number = {b"__npgeneric__": True, b"dtype": "|u1", b"data": int(rng.integers(-9, 999))}
+    values = [array, number, "text" * 9999, [[0] * 3] * 9999, np.nan, -1, {"a": {"b": {}}}]
+    return [*values, rng.normal(size=rng.integers(0, 6, size=4))][rng.integers(8)]
 
 
-WRONG: list[Callable[[np.random.Generator], Any]] = [
-    array_of,
-    lambda rng: {b"__npgeneric__": True, b"dtype": "|u1", b"data": int(rng.integers(-9, 999))},
-    lambda rng: "text" * int(rng.integers(0, 9999)),
-    lambda rng: [[0] * 3] * int(rng.integers(0, 9999)),
-    lambda rng: float(rng.choice([np.nan, np.inf, -np.inf, 1e308])),
-    lambda rng: int(rng.choice([-1, 2**63 - 1, 0])),
-    lambda rng: {"a": {"b": {}}},
-    lambda rng: rng.normal(size=rng.integers(0, 6, size=rng.integers(0, 5))),
-    lambda rng: rng.integers(0, 256, (rng.integers(0, 9), 3, 3), dtype=np.uint8),
-    lambda rng: np.arange(10.0)[::-1],
-]
-
-
-def wrong_fields(rng: np.random.Generator, fields: dict[str, Any]) -> bytes:
-    """A message of which some fields are wrong, missing or unknown."""
-    names = [*fields, "prompt", "reset", "guide/chunk", "guide/weight", "images_time/View1"]
-    names += ["images/left", "observation/state", "", "__class__", "x" * 300]
-    changed = dict(fields)
-    for name in rng.choice(names, rng.integers(1, 4)):
-        changed[str(name)] = WRONG[rng.integers(len(WRONG))](rng)
-    for name in rng.choice(list(fields), rng.integers(0, 3)):
-        changed.pop(str(name), None)
-    return wire.pack(changed)
-
-
-def wrong_bytes(rng: np.random.Generator, fields: dict[str, Any]) -> bytes:
-    """A good message cut short, with bytes turned or put into it."""
-    data = bytearray(wire.pack(fields))
-    if (kind := rng.integers(3)) == 0:
-        return bytes(data[: rng.integers(len(data))])
-    if kind == 1:
-        for place in rng.integers(0, min(len(data), 300), rng.integers(1, 20)):
-            data[place] = rng.integers(256)
-    else:
-        place = rng.integers(300)
-        data[place:place] = rng.bytes(int(rng.integers(1, 9)))
-    return bytes(data)
-
-
-def wrong_structure(rng: np.random.Generator, _: dict[str, Any]) -> bytes:
-    """Lengths that are not there, levels without end, types that no message has."""
-    heads = [b"\xdf", b"\xdd", b"\xc6", b"\xdb", b"\xc9", b"\xde", b"\xdc", b"\xda", b"\xc5"]
-    length = struct.pack(">I", int(rng.choice([2**32 - 1, 2**31, 2**20, 20_001, 65_535])))
-    deep = int(rng.choice([3, 13, 500, 1500, 200_000]))
+def broken(rng: np.random.Generator, fields: dict[str, Any]) -> Any:
+    """A message with wrong or unknown fields, cut off, with bytes put in, or of another kind."""
+    data, place = wire.pack(fields), rng.integers(300)
+    names = [*fields, "prompt", "reset", "guide/chunk", "images_time/View1", "__class__", "x" * 300]
     return [
-        bytes(rng.choice(heads)) + length + rng.bytes(9),
-        b"\x91" * deep + b"\xc0",
-        b"\x81\xa1a" * deep + b"\xc0",
-        msgpack.packb([[0] * 15_000] * int(rng.integers(1, 9))),
-        msgpack.packb(msgpack.ExtType(int(rng.integers(0, 127)), rng.bytes(20))),
-        rng.bytes(int(rng.integers(0, 5000))),
+        wire.pack(fields | {str(name): wrong(rng) for name in rng.choice(names, 2)}),
+        wire.pack(dict.fromkeys(fields, wrong(rng))),
+        data[: rng.integers(len(data))],
+        data[:place] + rng.bytes(9) + data[place:],
+        b"\x91" * int(rng.choice([13, 1500, 200_000])) + b"\xc0",
+        msgpack.packb([[0] * 15_000] * 9),
         b"\0" * (2**20 + 1),
-    ][rng.integers(7)]
+        "text",
+    ][rng.integers(8)]
 
 
 def over_a_socket(rng: np.random.Generator, address: str) -> None:
@@ -170,10 +131,7 @@ def over_a_socket(rng: np.random.Generator, address: str) -> None:
 
 def over_a_websocket(rng: np.random.Generator, address: str, fields: dict[str, Any]) -> bool:
     """Send a broken message, after a good one sometimes; whether it was refused."""
-    kinds = [wrong_fields, wrong_bytes, wrong_structure]
-    message: Any = kinds[rng.choice(3, p=[0.4, 0.35, 0.25])](rng, fields)
-    if rng.random() < 0.05:
-        message = "text" * int(rng.integers(0, 99))
+    message = broken(rng, fields)
     options: Any = {"compression": None, "max_size": None, "proxy": None}
     with connect(f"ws://{address}", **options) as bare:
         assert isinstance(bare.recv(20), bytes)

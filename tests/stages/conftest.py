@@ -1,6 +1,7 @@
 """Stages as processes of their own."""
 
 import os
+import shutil
 import subprocess
 import sys
 from collections.abc import Callable
@@ -50,13 +51,13 @@ def quick_params(
     return document
 
 
-@pytest.fixture(scope="module")
-def trained(
+@pytest.fixture(scope="session")
+def trained_once(
     tmp_path_factory: pytest.TempPathFactory,
     demo_checkpoint: Path,
     tiny_head: Callable[..., dict[str, Any]],
 ) -> Path:
-    """A params.yaml whose head is trained on two recordings of the phantom."""
+    """What `trained` is a copy of."""
     folder = tmp_path_factory.mktemp("phantom")
     for seed in (5, 6):
         write_raw(folder / "raw" / "task", simulate_episode(seed, 1.7e9 + 100 * seed))
@@ -78,6 +79,16 @@ def trained(
     path.write_text(yaml.safe_dump(document))
     for stage in (extract, train_head):
         assert run("", stage.main, ["--params", str(path)]) == 0
+    return path
+
+
+@pytest.fixture(scope="module")
+def trained(trained_once: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A params.yaml whose head is trained on two recordings of the phantom."""
+    before = trained_once.parent
+    folder = Path(shutil.copytree(before, tmp_path_factory.mktemp("trained") / "phantom"))
+    path = folder / trained_once.name
+    path.write_text(trained_once.read_text().replace(str(before), str(folder)))
     return path
 
 

@@ -107,6 +107,12 @@ class TestDamage:
         with pytest.raises(StoreIncomplete, match="golden"):
             merge([store, tiny_golden(tmp_path, name="other", seed=4)], tmp_path / "both.zarr")
 
+    @pytest.mark.parametrize("place", ["golden", "golden/1"])
+    def test_a_group_that_only_zarr_reads_is_looked_at(self, store, place):
+        (store / place / "zarr.json").unlink()
+        (issue,) = verify(store, threads=1).issues
+        assert issue.kind == "golden row" and f"{place}/zarr.json: no such file" in issue.message
+
     def test_a_file_beside_them_is_strange(self, store):
         (store / "golden/7").mkdir()
         (store / "golden/7/mine").write_text("?")

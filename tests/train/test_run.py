@@ -10,7 +10,7 @@ import pytest
 from pipeline.base.errors import CheckpointIncomplete, CheckpointMismatch, ConfigError
 from pipeline.base.files import HELD, MARKER, begin_folder, read_document
 from pipeline.store import FeatureStore
-from pipeline.train.run import RUN_FOLDER, TRAINER_VERSION, open_run
+from pipeline.train.run import RUN_FOLDER, TRAINER_VERSION, finished_run, open_run
 
 
 @pytest.fixture(scope="session")
@@ -57,6 +57,15 @@ def test_a_finished_run_is_left_alone(store, params, finished):
     run = open_run(params(device="cpu", logs="elsewhere", checkpoint_every=1), store)
     assert run.status == "finished"
     assert not leftover.exists()
+
+
+def test_a_finished_run_is_trained_anew_where_that_is_asked_for(store, params, finished):
+    """As `dvc repro` asks, where code changed that the run cannot see."""
+    anew = params(anew=True)
+    assert finished_run(anew, store.path) is None
+    run = open_run(anew, store)
+    assert run.status == "new" and "holds this very run; it is replaced" in run.notes[0]
+    assert finished_run(params(), store.path) is not None
 
 
 def test_another_run_replaces_a_finished_one_when_it_is_finished(store, params, trainer, finished):

@@ -33,7 +33,7 @@ def test_sources_are_counted_and_the_videos_codec_is_named(recordings: Path) -> 
     root, raw, lerobot, videos = check_recordings(given)
     assert {root.severity, raw.severity, lerobot.severity, videos.severity} == {"ok"}
     assert raw.message.startswith("2 episode(s), raw")
-    assert "2 episode(s), lerobot" in lerobot.message
+    assert "1 episode(s), lerobot" in lerobot.message
     assert videos.message.startswith("its videos are ")
 
 
