@@ -123,10 +123,15 @@ def _draw(by_variant: dict[str, list[Judged]]) -> Figure:
     for place, (name, own) in enumerate(by_variant.items()):
         for at, label in enumerate(labels):
             ended = [s for p in own if label in (p.task, "mean") for s in p.last]
+            if not ended:  # a task that this variant was not run on
+                continue
             rate = SuccessRate.of(ended)
             height = at + 0.8 * (place + 0.5) / len(by_variant)
             bars = [[100 * (rate.rate - rate.low)], [100 * (rate.high - rate.rate)]]
-            style = {"color": PALETTE[place % len(PALETTE)], "label": name if at == 0 else None}
+            style = {
+                "color": PALETTE[place % len(PALETTE)],
+                "label": name if at == len(tasks) else None,
+            }
             axis.errorbar(100 * rate.rate, height, xerr=np.maximum(bars, 0), fmt="o", **style)
     axis.set(xlim=(-2, 102), xlabel="success [%]", yticks=np.arange(len(labels)) + 0.4)
     axis.set_yticklabels(labels)
