@@ -99,7 +99,7 @@ def test_the_protocol_goes_from_demonstrations_to_a_table(
     capsys.readouterr()
     assert write_tables(run).exists()
     table = json.loads((run.out / "tables.json").read_text())["variants"]["features off"]
-    assert list(table) == [*tasks, "mean"] and table["mean"][-2:] == [1, 1]
+    assert list(table) == [*tasks, "mean of 1"] and table["mean of 1"][-2:] == [1, 1]
     assert "features off" in capsys.readouterr().out
 
 

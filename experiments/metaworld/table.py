@@ -68,9 +68,10 @@ def _judged(policy: TrainedPolicy) -> Iterator[Judged]:
 
 def success_table(name: str, policies: Sequence[Judged]) -> Table:
     """A row for each task, and their mean, of one variant."""
-    rows = [_row(task, [p for p in policies if p.task == task]) for task in _tasks(policies)]
+    tasks = _tasks(policies)
+    rows = [_row(task, [p for p in policies if p.task == task]) for task in tasks]
     heads = ("task", "best", "last", "validated", "policies", "episodes")
-    return Table(heads, [*rows, _row("mean", policies)], name)
+    return Table(heads, [*rows, _row(f"mean of {len(tasks)}", policies)], name)
 
 
 def _row(label: str, policies: Sequence[Judged]) -> tuple[Any, ...]:
@@ -119,19 +120,21 @@ def write_tables(run: Run) -> Path:
 def _draw(by_variant: dict[str, list[Judged]]) -> Figure:
     tasks = _tasks([one for own in by_variant.values() for one in own])
     figure, axis = panels(9.0, 1.2 + 0.35 * len(by_variant) * (len(tasks) + 1) / 2, 1, 1)
-    labels = [*tasks, "mean"]
+    labels, named = [*tasks, "mean"], set[str]()
     for place, (name, own) in enumerate(by_variant.items()):
         for at, label in enumerate(labels):
-            ended = [s for p in own if label in (p.task, "mean") for s in p.last]
-            if not ended:  # a task that this variant was not run on
+            whole = label == "mean" and _tasks(own) == tasks
+            ended = [s for p in own if whole or p.task == label for s in p.last]
+            if not ended:  # this variant was run on other tasks
                 continue
             rate = SuccessRate.of(ended)
             height = at + 0.8 * (place + 0.5) / len(by_variant)
             bars = [[100 * (rate.rate - rate.low)], [100 * (rate.high - rate.rate)]]
             style = {
                 "color": PALETTE[place % len(PALETTE)],
-                "label": name if at == len(tasks) else None,
+                "label": None if name in named else name,
             }
+            named.add(name)
             axis.errorbar(100 * rate.rate, height, xerr=np.maximum(bars, 0), fmt="o", **style)
     axis.set(xlim=(-2, 102), xlabel="success [%]", yticks=np.arange(len(labels)) + 0.4)
     axis.set_yticklabels(labels)
