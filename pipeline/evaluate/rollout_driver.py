@@ -252,6 +252,11 @@ class _Episode:
     def record(self, controller: str, stop: str | None = None) -> RolloutEpisode:
         """The record of the episode, which has ended, by its outcome or by a safe stop."""
         environment, robot = self.environment, self.environment.robot
+        if stop is None and "success" not in self.info:
+            raise ConfigError(
+                f"rollout.environment: {robot.name}: expected `success` in the info of the last "
+                f"step, found {', '.join(self.info) or 'nothing'}"
+            )
         success = stop is None and bool(self.info["success"])
         ended = self.info.get("reason", "succeeded" if success else "failed")
         time_s = float(self.readings["time"][0])

@@ -1,4 +1,8 @@
-"""A simulated needle insertion: physics, cameras, and recordings of it in every format.
+"""Simulated robots; above all a needle insertion, with recordings of it in every format.
+
+interface.py            what an environment must have for rollouts
+environments.py         the environments by name
+meta_world.py           tasks of Meta-World
 
 arm.py                  pose, orientation, motion and joints of the arm that carries the needle
 needle_sensor.py        force and OCT A-scan at the needle

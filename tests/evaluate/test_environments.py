@@ -28,6 +28,11 @@ DEMONSTRATED = """
 class Held(Slide):
     def expert_action(self):
         return np.sign([-self.x_mm])
+
+
+class Silent(Slide):
+    def step(self, action):
+        return *super().step(action)[:4], {}
 """
 TASK = "Move the cart to the middle"
 
@@ -117,6 +122,8 @@ def test_what_cannot_be_rolled_out_is_refused_by_name() -> None:
         driven("phantom")
     with pytest.raises(ConfigError, match=r"rollout\.environment: slide:Sled: expected Sled"):
         environment("slide:Sled")
+    with pytest.raises(ConfigError, match=r"expected `success` in the info .* found nothing"):
+        driven("slide:Silent", towards_the_middle)
     with pytest.raises(ConfigError, match="expected a RobotEnvironment"):
         environment("fractions:Fraction")
     with pytest.raises(ValueError, match=r"metaworld:TASK or module:name, found 'phantm'"):
