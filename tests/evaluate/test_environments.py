@@ -1,6 +1,7 @@
 """Policies are rolled out in environments that are not the phantom, as the recipe shows."""
 
 import re
+import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -23,7 +24,7 @@ from tests.robot.conftest import build_policy as made
 from tests.simulation.environment_contract import EnvironmentContract
 
 RECIPE = Path(__file__).parents[2] / "docs" / "recipes" / "environment.md"
-DEMONSTRATED = """
+VARIED = """
 
 class Held(Slide):
     def expert_action(self):
@@ -41,12 +42,9 @@ TASK = "Move the cart to the middle"
 def slide(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The module of the recipe, which another test may have imported from another folder."""
     (code,) = re.findall(r"^```python\n(.*?)^```$", RECIPE.read_text(), re.DOTALL | re.MULTILINE)
-    more = (
-        "\n\nclass Held(Slide):\n    def expert_action(self):\n        return np.sign([-self.x_mm])"
-    )
-    (tmp_path / "slide.py").write_text(code + more)
+    (tmp_path / "slide.py").write_text(code + VARIED)
     monkeypatch.syspath_prepend(tmp_path)
-    monkeypatch.delitem(__import__("sys").modules, "slide", raising=False)
+    monkeypatch.delitem(sys.modules, "slide", raising=False)
 
 
 def environment(name: str) -> RobotEnvironment:
