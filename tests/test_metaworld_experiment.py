@@ -94,6 +94,8 @@ def test_the_protocol_goes_from_demonstrations_to_a_table(
     before = {p: p.stat().st_mtime_ns for p in policy.folder.rglob("*") if p.is_file()}
     run_here(run, monkeypatch)
     assert before == {p: p.stat().st_mtime_ns for p in policy.folder.rglob("*") if p.is_file()}
+    with pytest.raises(ConfigError, match="found those of another run"):
+        run_here(replace(run, episodes=2), monkeypatch)
     (one,) = judged(run)
     assert one.task == tasks[0] and {len(ended) for ended in one.successes.values()} == {1}
     capsys.readouterr()

@@ -25,6 +25,7 @@ from tqdm import tqdm
 
 from experiments.metaworld.recording import Record, record, seeds_of
 from pipeline.base.config import Params, load_params
+from pipeline.base.errors import ConfigError
 from pipeline.policy.checkpoint import find_policy, load_policy
 from pipeline.simulation.meta_world import INSTRUCTIONS
 from pipeline.train.loop import Trainer
@@ -154,8 +155,7 @@ def run_protocol(wanted: Run) -> None:
     """Do what is missing: recordings, model, stores, policies, rollouts."""
     out = wanted.out
     out.mkdir(parents=True, exist_ok=True)
-    text = _PARAMS.read_text(encoding="utf-8").replace("{out}", str(out))
-    (out / "params.yaml").write_text(text, encoding="utf-8")
+    _write_params(wanted)
     asked = [
         Record(task=task, run=0, episodes=EPISODES, image=224, shadows=False)
         for task in wanted.tasks
@@ -178,6 +178,23 @@ def run_protocol(wanted: Run) -> None:
             ended.result()
     finally:  # what is under way may end, nothing more begins
         pool.shutdown(cancel_futures=True)
+
+
+def _write_params(wanted: Run) -> None:
+    """Write the params that all policies in the folder share.
+
+    Raises `ConfigError` where the folder was begun with others, whose policies would be mixed up
+    with those of now.
+    """
+    asked = {"checkpoint": wanted.checkpoint, "episodes": wanted.episodes}
+    text = f"# run with {asked}\n" + _PARAMS.read_text(encoding="utf-8")
+    text, file = text.replace("{out}", str(wanted.out)), wanted.out / "params.yaml"
+    if file.exists() and file.read_text(encoding="utf-8") != text:
+        raise ConfigError(
+            f"{file}: expected the params of now ({asked}), found those of another run. Name "
+            "another folder with --out"
+        )
+    file.write_text(text, encoding="utf-8")
 
 
 def train_and_roll_out(policy: TrainedPolicy) -> None:
