@@ -25,7 +25,7 @@ from pipeline.look.page.blocks import (
 from pipeline.look.page.style import GRID, INK, canvas
 from pipeline.look.page.writing import write_report
 
-DESKTOP, PHONE = (1280, 900), (390, 844)
+WIDE, DESKTOP, PHONE = (1920, 1080), (1280, 900), (390, 844)
 
 
 @dataclass
@@ -110,6 +110,10 @@ LOOK = """() => {
   return {
     overflow: document.documentElement.scrollWidth - window.innerWidth,
     pictures: pictures.length,
+    cut: [...document.querySelectorAll("table")].filter((table) => {
+      const [first, second] = table.rows[0].cells;
+      return box(second ?? first).left > innerWidth - 20;
+    }).map((table) => table.textContent.trim().slice(0, 60)),
     unseen: named(pictures.filter((svg) => !seen(svg))),
     faint: said.filter((one) => contrast(one) < 4.5).map((one) => one.outerHTML.slice(0, 90)),
     unnamed: named(pictures.filter((svg) => !svg.querySelector(":scope > title")?.textContent)),
@@ -126,16 +130,18 @@ LOOK = """() => {
 
 @pytest.fixture
 def assert_page_is_sound(browser_page: Visitor) -> Callable[[Path], None]:
-    """`assert_page_is_sound(path)`: at desktop and phone width, in light and in dark.
+    """`assert_page_is_sound(path)`: at three widths, and at two of them in light and in dark.
 
-    Nothing errs, no request leaves the page, nothing overflows, every picture is there in an
+    Nothing errs, no request leaves the page, nothing overflows, what a table says first can be seen
+    without scrolling sideways, every picture is there in an
     ink that contrasts, words contrast as WCAG's AA wants, every link of the contents leads
     somewhere, and no id is there twice. Each width is loaded in one scheme and goes over to the
     other as a system does at dusk.
     """
 
     def check(path: Path) -> None:
-        for size, schemes in ((DESKTOP, ("light", "dark")), (PHONE, ("dark", "light"))):
+        both = ((DESKTOP, ("light", "dark")), (PHONE, ("dark", "light")))
+        for size, schemes in ((WIDE, ("light",)), *both):
             visit = browser_page(path, size, schemes[0])
             for scheme in schemes:
                 visit.page.emulate_media(color_scheme=scheme)
@@ -149,7 +155,7 @@ def assert_is_sound(visit: Visit, scheme: str, here: str) -> None:
     assert visit.trouble == [], here
     assert found["overflow"] <= 0, here
     assert found["links"] > 0, here
-    for wrong in ("unseen", "unnamed", "faint", "dead", "twice"):
+    for wrong in ("cut", "unseen", "unnamed", "faint", "dead", "twice"):
         assert found[wrong] == [], f"{here}: {wrong}"
     inks = found["inks"]
     if scheme == "light":
