@@ -97,7 +97,7 @@ def evaluation_report(evaluation: Evaluation, rollout: str = "") -> Report:
     notes = [note for note in (trained_on_too(evaluation.checkpoint), still) if note]
     return Report(
         title=f"Evaluation of {evaluation.name}",
-        verdict=_verdict(comparison),
+        verdict=_verdict(comparison, bool(evaluation.checkpoint.shape.anchors)),
         summary=(
             f"{policy['model_type']} expert, {policy['fusion_strategy']} fusion, step "
             f"{policy['step']}, {policy['parameters']:,} parameters, judged on "
@@ -120,7 +120,7 @@ def evaluation_report(evaluation: Evaluation, rollout: str = "") -> Report:
     )
 
 
-def _verdict(comparison: Comparison) -> str:
+def _verdict(comparison: Comparison, anchored: bool) -> str:
     """The policy's executed steps beside the best baseline, in words."""
     rivals = rivalry(comparison.executed)
     best = _DOING[rivals.best]
@@ -128,7 +128,8 @@ def _verdict(comparison: Comparison) -> str:
         return f"Not told apart from {best}, in what is executed"
     if rivals.ratio <= 1:
         return f"In what is executed, the policy errs {_times(1 / rivals.ratio)} less than {best}"
-    return f"In what is executed, the policy is {_times(rivals.ratio)} worse than {best}"
+    worse = f"In what is executed, the policy is {_times(rivals.ratio)} worse than {best}"
+    return worse + ", as an anchored policy may be" * anchored
 
 
 def _times(ratio: float) -> str:
@@ -139,9 +140,14 @@ def _times(ratio: float) -> str:
 def _advice(evaluation: Evaluation, rollout: str) -> Iterator[str]:
     executed = evaluation.comparison.executed
     rivals, groups = rivalry(executed), len(np.unique(executed.cells.group))
-    if rivals.verdict != "better":
+    if rivals.verdict != "better" and evaluation.checkpoint.shape.anchors:
         yield (
-            "Look below at which streams are used and at the training curve, then go through "
+            "The policy is anchored: it errs more at its first step on purpose (docs/late.md), so "
+            "judge it by rollouts."
+        )
+    elif rivals.verdict != "better":
+        yield (
+            "Look above at which streams are used and at the training curve, then go through "
             "docs/worse.md: it says which switch first."
         )
     if groups < _FEW:

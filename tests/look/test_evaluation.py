@@ -24,6 +24,7 @@ from pipeline.look.page.writing import PAGE, write_report
 from pipeline.policy.checkpoint import PolicyCheckpoint
 from pipeline.policy.normalization import ChannelStatistics, Normalization
 from pipeline.policy.policy import Policy
+from pipeline.policy.shape import Anchor
 from pipeline.store import FeatureStore, episode_name
 from pipeline.train.batches import Windows
 from pipeline.train.predictions import predict
@@ -144,6 +145,19 @@ def test_the_verdict_is_a_sentence(
     advice = " ".join(block.words for block in section(report, "What to do next").blocks)
     assert ("docs/worse.md" in advice) == ("less" not in verdict)
     assert "Hold out more" in advice and ("vla-cache rollout" in advice) == ("less" in verdict)
+
+
+def test_an_anchored_policy_is_judged_by_rollouts(
+    judgement: Evaluation, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    error, none = Figure(3.0, None, None), Figure(1.0, None, None)
+    rivals = Rivalry(error, "linear_fit", none, Figure(2.0, 1.0, 3.0))
+    monkeypatch.setattr("pipeline.look.evaluation.rivalry", lambda part: rivals)
+    shape = replace(judgement.checkpoint.shape, anchors=(Anchor((0,), (0,)),))
+    anchored = replace(judgement, checkpoint=replace(judgement.checkpoint, shape=shape))
+    report = evaluation_report(anchored)
+    assert report.verdict.endswith(", as an anchored policy may be")
+    assert "on purpose" in section(report, "What to do next").blocks[0].words
 
 
 def test_the_page_of_rollouts_is_linked_where_there_is_one(judgement: Evaluation) -> None:
