@@ -44,7 +44,7 @@ _Small = Annotated[int, Field(ge=0, le=2**20)]
 class SlotDocument(Document):
     """One pooled vector of a VL row, as `pipeline.vlm.slots.Slot.document` writes it."""
 
-    layer: _Small
+    layer: _Small | Literal["vision"]
     norm: bool
     pooling: Text
     view: ViewName | None = None

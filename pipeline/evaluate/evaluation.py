@@ -98,7 +98,7 @@ def evaluate_checkpoint(
     )
     if note := trained_on_too(checkpoint):
         say(f"warning: {note}")
-    features = checkpoint.normalization.features
+    features = checkpoint.statistics("features") if checkpoint.normalization.features else None
     baselines = Baselines(store, training, horizon, features)
     space = action_space(store, checkpoint.normalization)
     groups = groups_of(store, checkpoint, ticks)

@@ -13,6 +13,7 @@ from pipeline.evaluate.probe.study import ProbeResult, ProbeStudy, recommend
 from pipeline.evaluate.probe.tables import advice, notes, ranking
 from pipeline.look.page.blocks import Picture, Report, Section, Text, next_steps
 from pipeline.look.page.style import canvas, draw_map
+from pipeline.vlm.slots import layer_name
 
 _MAPS = 6
 """The most maps of the cells of a view; the layers of a model look alike."""
@@ -121,7 +122,7 @@ def _limits(values: Sequence[float]) -> tuple[float, float]:
 
 
 def _row(name: SlotName) -> str:
-    return f"layer {name.layer}{'' if name.norm else ', no norm'}"
+    return layer_name(name.layer, name.norm)
 
 
 def _column(name: SlotName) -> str:

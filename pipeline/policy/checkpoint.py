@@ -40,8 +40,8 @@ from pipeline.base.source import (
     SourceDocument,
     row_key,
 )
-from pipeline.policy.normalization import Normalization
-from pipeline.policy.shape import MOST, PolicyShape, typical_state
+from pipeline.policy.normalization import ChannelStatistics, Normalization
+from pipeline.policy.shape import MOST, PolicyShape, slot_places, typical_state
 
 if TYPE_CHECKING:
     import torch
@@ -111,6 +111,10 @@ class PolicyDocument(SourceDocument):
             "shape.state_kinds": (len(shape.state_kinds), {0, shape.state_dim}),
             "shape.slots": (shape.slots, {len(plain)}),
             "shape.feature_dim": (shape.feature_dim, {spec.dim}),
+            "shape.places": (
+                shape.places,
+                {(), slot_places([slot.model_dump(exclude_none=True) for slot in plain])},
+            ),
             # 0 where the policy does not see the stream; earlier versions had no views.
             "shape.sensor_channels": (shape.sensor_channels, {0, len(streams.sensor.names)}),
             "shape.state_dim": (shape.state_dim, {0, len(streams.state.names)}),
@@ -185,10 +189,15 @@ class PolicyCheckpoint:
         policy.load_state_dict(dict(self.weights))
         return policy.to(device).eval()
 
+    def statistics(self, stream: str) -> ChannelStatistics:
+        """The training statistics of a stream, for features those of each slot (slot, dim)."""
+        fitted: ChannelStatistics | None = getattr(self.normalization, stream)
+        assert fitted is not None, "a policy has statistics of every stream that it sees"
+        return fitted.at(self.shape.statistics_of) if stream == "features" else fitted
+
     def typical(self, stream: str) -> NDArray[np.float64]:
         """The training mean of a stream: a reading (channel,), or features (slot, dim)."""
-        statistics = getattr(self.normalization, stream)
-        assert statistics is not None, "a policy has statistics of every stream that it sees"
+        statistics = self.statistics(stream)
         if stream != "state":
             return statistics.mean
         return np.array(typical_state(statistics.mean.tolist(), self.shape.kinds))

@@ -12,12 +12,20 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from pipeline.base.config import TrainHeadParams
+from pipeline.base.config import FeatureEncoderParams, TrainHeadParams
 from pipeline.base.errors import ConfigError
 from pipeline.policy.ages import AgeEncoder, at_even_ages, even_ages
-from pipeline.policy.attention import TransformerLayer, learned, masked_mean, right_aligned
+from pipeline.policy.attention import (
+    Attention,
+    TransformerLayer,
+    learned,
+    masked_mean,
+    right_aligned,
+)
 from pipeline.policy.shape import PolicyShape
 
+_OCTAVES = 5
+"""Wavelengths of a place: from twice the view's side to an eighth of it."""
 _FORCE_SHARE = 4
 """`ForceAwareSensorEncoder` gives force one part in so many of an encoded window."""
 
@@ -50,6 +58,7 @@ class FeatureEncoder(nn.Module):
         slot_valid: Bool[Tensor, "batch slot"],
         age_s: Float[Tensor, " batch"],
         view_age_s: Float[Tensor, "batch view"] | None = None,
+        state: Float[Tensor, "batch 1 _"] | None = None,
     ) -> Float[Tensor, "batch slot width"]:
         """Encode; the content of a slot that is not valid reaches neither output nor gradients.
 
@@ -59,11 +68,135 @@ class FeatureEncoder(nn.Module):
         slots = self.squeeze(features.masked_fill(absent, 0.0)) + self.slot
         slots = torch.where(absent, self.missing.to(slots.dtype), slots)
         slots = nn.functional.gelu(self.norm(slots), approximate="tanh")
-        ages = age_s[:, None]
-        if view_age_s is not None:
-            ages = torch.cat([ages, view_age_s], dim=1)
-        ages = ages.masked_fill(~slot_valid.any(dim=1, keepdim=True), torch.nan)
+        ages = known_ages(slot_valid, age_s, view_age_s)
         return slots + self.age(ages).unsqueeze(1).masked_fill(absent, 0.0)
+
+
+class MeanFeatureEncoder(FeatureEncoder):
+    """As `FeatureEncoder`, of one slot a layer: the mean of that layer's valid slots."""
+
+    def __init__(self, layers: int, feature_dim: int, views: int = 0) -> None:
+        super().__init__(layers, feature_dim, views=views)
+
+    def forward(
+        self,
+        features: Float[Tensor, "batch slot dim"],
+        slot_valid: Bool[Tensor, "batch slot"],
+        age_s: Float[Tensor, " batch"],
+        view_age_s: Float[Tensor, "batch view"] | None = None,
+        state: Float[Tensor, "batch 1 _"] | None = None,
+    ) -> Float[Tensor, "batch layer width"]:
+        """Encode, as `FeatureEncoder.forward`."""
+        valid = slot_valid.unflatten(1, (self.slots, -1))
+        means = masked_mean(
+            features.unflatten(1, valid.shape[1:]).flatten(0, 1), valid.flatten(0, 1)
+        )
+        means = means.unflatten(0, valid.shape[:2])
+        return super().forward(means, valid.any(dim=-1), age_s, view_age_s)
+
+
+class SlotAttention(nn.Module):
+    """Tokens take from the keys what they ask for; then a feed-forward network."""
+
+    def __init__(self, dim: int, heads: int) -> None:
+        super().__init__()
+        self.norm = nn.LayerNorm(dim)
+        self.attention = Attention(dim, heads)
+        self.feed_forward = nn.Sequential(
+            nn.LayerNorm(dim),
+            nn.Linear(dim, 4 * dim),
+            nn.GELU(approximate="tanh"),
+            nn.Linear(4 * dim, dim),
+        )
+
+    def forward(
+        self,
+        tokens: Float[Tensor, "batch query dim"],
+        keys: Float[Tensor, "batch slot dim"],
+        valid: Bool[Tensor, "batch slot"],
+        steer: Float[Tensor, "batch 1 dim"] | float = 0.0,
+    ) -> Float[Tensor, "batch query dim"]:
+        """The tokens after this layer; `steer` is added to what they ask, not to what they are."""
+        tokens = tokens + self.attention(self.norm(tokens) + steer, keys, valid)
+        return tokens + self.feed_forward(tokens)
+
+
+class FeaturePooler(nn.Module):
+    """Learned queries that attend to the slots: features (batch, slot, dim) -> (batch, query, dim).
+
+    The slots of a place in all layers become one key, by a learned mixture of the layers. A key
+    knows where in which view it looks, by Fourier features of its cell's centre (Tancik et al.
+    2020) and embeddings of view and pooling, so that parameters do not grow with the number of
+    slots. Keys without a valid slot are masked. The state moves the queries through a gate that is
+    0 at first: it directs where they look, but the values are of the slots alone.
+    """
+
+    def __init__(self, shape: PolicyShape, params: FeatureEncoderParams, state_dim: int) -> None:
+        super().__init__()
+        places, dim = shape.places, params.dim
+        self.layers = shape.layers
+        self.mixture = nn.Parameter(torch.zeros(shape.layers))
+        self.squeeze = nn.Linear(shape.feature_dim, dim)
+        kinds = [
+            sorted({place.pooling for place in places}),
+            sorted({p.view or "" for p in places}),
+        ]
+        self.kinds = nn.ModuleList(nn.Embedding(len(names), dim) for names in kinds)
+        index = [[kinds[0].index(p.pooling), kinds[1].index(p.view or "")] for p in places]
+        centers = torch.tensor([p.center or (0.5, 0.5) for p in places])
+        waves = centers[..., None] * torch.pi * 2 ** torch.arange(_OCTAVES)
+        waves = torch.cat([waves.sin(), waves.cos()], dim=-1).flatten(1)
+        self.register_buffer("index", torch.tensor(index), persistent=False)
+        self.register_buffer("waves", waves, persistent=False)
+        self.where = nn.Linear(waves.shape[1], dim)
+        self.queries = learned(params.queries, dim)
+        self.steer = nn.Linear(state_dim, dim) if state_dim else None
+        self.gate = nn.Parameter(torch.zeros(dim))
+        self.reads = nn.ModuleList(SlotAttention(dim, params.heads) for _ in range(params.layers))
+        self.key_norm, self.norm = nn.LayerNorm(dim), nn.LayerNorm(dim)
+        self.missing = learned(params.queries, dim)
+        self.age = AgeEncoder(1 + shape.views, dim)
+
+    def forward(
+        self,
+        features: Float[Tensor, "batch slot dim"],
+        slot_valid: Bool[Tensor, "batch slot"],
+        age_s: Float[Tensor, " batch"],
+        view_age_s: Float[Tensor, "batch view"] | None = None,
+        state: Float[Tensor, "batch 1 _"] | None = None,
+    ) -> Float[Tensor, "batch query width"]:
+        """Encode; nothing of a slot that is not valid reaches the output or a gradient."""
+        features = features.masked_fill(~slot_valid.unsqueeze(-1), 0.0)
+        mixed = torch.einsum(
+            "blpd,l->bpd", features.unflatten(1, (self.layers, -1)), self.mixture.softmax(dim=0)
+        )
+        place = self.where(self.waves)
+        for embedding, index in zip(self.kinds, self.index.T, strict=True):
+            place = place + embedding(index)
+        keys = self.key_norm(self.squeeze(mixed) + place)
+        present = slot_valid.unflatten(1, (self.layers, -1)).any(dim=1)
+        missing = ~present.any(dim=1, keepdim=True)
+        steer = 0.0
+        if self.steer is not None and state is not None:
+            steer = self.gate * self.steer(state)
+        tokens = self.queries.expand(len(features), -1, -1)
+        for read in self.reads:
+            # A row without any slot attends to what it lacks: softmax over nothing is NaN.
+            tokens = read(tokens, keys, present | missing, steer)
+        ages = self.age(known_ages(slot_valid, age_s, view_age_s)).unsqueeze(1)
+        return torch.where(missing.unsqueeze(-1), self.missing, self.norm(tokens) + ages)
+
+
+def known_ages(
+    slot_valid: Bool[Tensor, "batch slot"],
+    age_s: Float[Tensor, " batch"],
+    view_age_s: Float[Tensor, "batch view"] | None,
+) -> Float[Tensor, "batch age"]:
+    """The ages of the newest frame and of each view; NaN where a sample has no valid slot."""
+    ages = age_s[:, None]
+    if view_age_s is not None:
+        ages = torch.cat([ages, view_age_s], dim=1)
+    return ages.masked_fill(~slot_valid.any(dim=1, keepdim=True), torch.nan)
 
 
 class HalvingBlock(nn.Module):
@@ -288,6 +421,25 @@ SENSOR_ENCODERS: dict[str, type[SensorEncoder] | type[ForceAwareSensorEncoder]] 
 """The class of each `train_head.sensor_encoder.kind`."""
 
 
+def build_feature_encoder(
+    params: FeatureEncoderParams, shape: PolicyShape, state_dim: int
+) -> FeatureEncoder | FeaturePooler:
+    """The encoder of this kind; `state_dim` is the width of the state's token, 0 for none.
+
+    Raises `ConfigError` where the shape does not say which slots are of one layer.
+    """
+    if params.kind == "linear":
+        return FeatureEncoder(shape.slots, shape.feature_dim, views=shape.views)
+    if not shape.places:
+        raise ConfigError(
+            f"train_head.feature_encoder.kind {params.kind}: expected to know the layer and place "
+            "of each slot, which only a store says. Train from a store, or use kind: linear."
+        )
+    if params.kind == "mean":
+        return MeanFeatureEncoder(shape.layers, shape.feature_dim, shape.views)
+    return FeaturePooler(shape, params, state_dim)
+
+
 def build_encoders(
     params: TrainHeadParams, shape: PolicyShape
 ) -> tuple[nn.ModuleDict, dict[str, tuple[int, int]]]:
@@ -297,8 +449,16 @@ def build_encoders(
     """
     encoders, tokens = nn.ModuleDict(), dict[str, tuple[int, int]]()
     if params.features_enabled and shape.slots and shape.feature_dim:
-        features = FeatureEncoder(shape.slots, shape.feature_dim, views=shape.views)
-        encoders["features"], tokens["features"] = features, (shape.slots, features.width)
+        state_dim = params.state_encoder.output_dim
+        steered = params.feature_encoder.state and params.robot_state_enabled and shape.state_dim
+        features = build_feature_encoder(params.feature_encoder, shape, state_dim if steered else 0)
+        encoders["features"] = features
+        pooled = params.feature_encoder
+        tokens["features"] = (
+            (pooled.queries, pooled.dim)
+            if isinstance(features, FeaturePooler)
+            else (features.slots, features.width)
+        )
     if params.sensor_enabled and shape.sensor_channels:
         sensor = params.sensor_encoder
         encoders["sensor"] = SENSOR_ENCODERS[sensor.kind](

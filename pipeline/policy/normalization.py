@@ -86,6 +86,21 @@ class ChannelStatistics:
         """
         return replace(self, std=np.maximum(self.std, _LEAST_SPREAD * usual))
 
+    def at(self, index: Sequence[int]) -> "ChannelStatistics":
+        """The statistics of slots that share them: `index` (slot,) of the statistics of each."""
+        return replace(self, mean=self.mean[[*index]], std=self.std[[*index]])
+
+    def shared(self, index: Sequence[int]) -> "ChannelStatistics":
+        """The statistics of slots (slot, dim) together where their `index` (slot,) is equal.
+
+        Slots that share them are valid in the same rows, so each counts as much.
+        """
+        groups = np.array(index) == np.arange(max(index) + 1)[:, None]
+        share = groups / groups.sum(axis=1, keepdims=True)
+        mean = share @ self.mean
+        variance = share @ (self.std**2 + (self.mean - mean[[*index]]) ** 2)
+        return replace(self, mean=mean, std=np.sqrt(variance))
+
     def document(self) -> dict[str, Any]:
         """The statistics as JSON values; Python writes the shortest digits that read equal."""
         return {"mean": self.mean.tolist(), "std": self.std.tolist(), "count": self.count}

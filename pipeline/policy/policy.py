@@ -136,9 +136,10 @@ class Policy(Trainable):
         super().__init__()
         self.params, self.shape = params, shape
         self.encoders, tokens = build_encoders(params, shape)
-        self.normalizers = nn.ModuleDict(
-            {name: Normalizer(getattr(normalization, name)) for name in self.encoders}
-        )
+        statistics = {name: getattr(normalization, name) for name in self.encoders}
+        if "features" in statistics:
+            statistics["features"] = statistics["features"].at(shape.statistics_of)
+        self.normalizers = nn.ModuleDict({n: Normalizer(fit) for n, fit in statistics.items()})
         self.action_normalizer = Normalizer(normalization.relative or normalization.action)
         expert = params.expert
         self.fusion = build_fusion(params.fusion_strategy, tokens, expert.dim, expert.heads)
@@ -156,12 +157,16 @@ class Policy(Trainable):
         self, observation: Observation, validity: Mapping[str, Tensor] | None = None
     ) -> Context:
         """The context of the expert; by default from every valid part of the observation."""
-        return self.fusion(
-            {
-                name: self.encode(name, observation, valid)
-                for name, valid in (validity or self._validity(observation)).items()
-            }
-        )
+        validity = validity or self._validity(observation)
+        windows = {
+            name: self._encode_window(name, observation, valid)
+            for name, valid in validity.items()
+            if name != "features"
+        }
+        if "features" not in validity:
+            return self.fusion(windows)
+        features = self._encode_features(observation, validity["features"], windows.get("state"))
+        return self.fusion({"features": features, **windows})
 
     def loss(
         self,
@@ -238,17 +243,19 @@ class Policy(Trainable):
         parts = {**dict(self.encoders.items()), "fusion": self.fusion, "expert": self.expert}
         return [(name, sum(p.numel() for p in part.parameters())) for name, part in parts.items()]
 
-    def encode(
-        self, stream: str, observation: Observation, valid: Tensor
+    def _encode_features(
+        self, observation: Observation, valid: Tensor, state: Tensor | None
     ) -> Float[Tensor, "batch token width"]:
-        """The tokens of a stream, from the part that `valid` counts or marks."""
-        normalizer, encoder = self.normalizers[stream], self.encoders[stream]
-        assert isinstance(normalizer, Normalizer)
-        values = getattr(observation, stream)
-        if stream == "features":
-            values = normalizer.normalize(values).clamp_(-_LARGEST, _LARGEST)
-            return encoder(values, valid, observation.feature_age, observation.view_age)
-        ages = getattr(observation, AGES[stream])
+        """The tokens of the slots that `valid` marks; `state` is the state's token."""
+        values = self._normalized("features", observation.features)
+        ages = observation.feature_age, observation.view_age
+        return self.encoders["features"](values, valid, *ages, state)
+
+    def _encode_window(
+        self, stream: str, observation: Observation, valid: Tensor
+    ) -> Float[Tensor, "batch 1 width"]:
+        """The token of the newest `valid` readings of a stream."""
+        values, ages = getattr(observation, stream), getattr(observation, AGES[stream])
         if stream == "state":
             if self.params.anchored:  # the older readings tell the motion since a frame
                 newest = min(values.shape[1], self.params.state_window)
@@ -257,8 +264,12 @@ class Policy(Trainable):
                 older = (ages > oldest_s).sum(dim=1)
                 valid = (valid.clamp(max=newest) - older).clamp(min=0)
             values = expand(values, self.shape.kinds)
-        values = normalizer.normalize(values).clamp_(-_LARGEST, _LARGEST)
-        return encoder(values, valid, ages).unsqueeze(1)
+        return self.encoders[stream](self._normalized(stream, values), valid, ages).unsqueeze(1)
+
+    def _normalized(self, stream: str, values: Tensor) -> Tensor:
+        normalizer = self.normalizers[stream]
+        assert isinstance(normalizer, Normalizer)
+        return normalizer.normalize(values).clamp_(-_LARGEST, _LARGEST)
 
     def _validity(self, observation: Observation) -> dict[str, Tensor]:
         return {name: getattr(observation, VALIDITY[name]) for name in self.encoders}

@@ -7,12 +7,14 @@ from typing import Annotated, Any, Literal
 
 from pydantic import ConfigDict, Field
 
+from pipeline.base.border import Text
 from pipeline.base.errors import ConfigError
 
 MOST = 1_000_000
 """The most channels of a stream, slots or widths of features."""
 Size = Annotated[int, Field(ge=0, le=MOST)]
 Group = Annotated[str, Field(pattern="^(translation|rotation|gripper|other)$")]
+Share = Annotated[float, Field(ge=0, le=1)]
 Axes = Mapping[str, int | None]
 """Names and sizes of a tensor's axes; None is any size above 0."""
 
@@ -75,6 +77,50 @@ class Anchor:
     action: tuple[Size, ...]
     state: tuple[Size, ...]
     composed: bool = False
+
+
+@dataclass(frozen=True)
+class SlotPlace:
+    """What a slot is pooled over, without its layer: all layers of a store have the same places."""
+
+    __pydantic_config__ = ConfigDict(strict=True, extra="forbid")
+
+    pooling: Text
+    view: Text | None = None
+    center: tuple[Share, Share] | None = None
+    """Row and column of its cell's centre, as shares of the view's height and width."""
+
+
+def slot_places(documents: Sequence[Mapping[str, Any]]) -> tuple[SlotPlace, ...]:
+    """The places of a spec's slots of one variant, in order; the layers repeat them."""
+    first = (documents[0]["layer"], documents[0]["norm"]) if documents else None
+    ours = [slot for slot in documents if (slot["layer"], slot["norm"]) == first]
+    sides: dict[str, tuple[int, int]] = {}
+    for slot in ours:
+        if cell := slot.get("cell"):
+            rows, columns = sides.get(slot["pooling"], (0, 0))
+            sides[slot["pooling"]] = max(rows, cell[0] + 1), max(columns, cell[1] + 1)
+    places = []
+    for slot in ours:
+        pooling, cell = slot["pooling"], slot.get("cell")
+        rows, columns = sides.get(pooling, (1, 1))
+        center = ((cell[0] + 0.5) / rows, (cell[1] + 0.5) / columns) if cell else None
+        places.append(SlotPlace(pooling, slot.get("view"), center))
+    return tuple(places)
+
+
+def shared_statistics(places: Sequence[SlotPlace], layers: int) -> tuple[int, ...]:
+    """For each slot the index of its statistics, which the tokens of a layer and view share.
+
+    Other slots have their own: on a fixed camera, a cell's own mean takes out the background.
+    """
+    kinds = [
+        (layer, place.view if place.pooling == "tokens" else index)
+        for layer in range(layers)
+        for index, place in enumerate(places)
+    ]
+    number = {kind: index for index, kind in enumerate(dict.fromkeys(kinds))}
+    return tuple(number[kind] for kind in kinds)
 
 
 def find_anchors(
@@ -163,6 +209,18 @@ class PolicyShape:
     """Action channels that count from the newest frame; the others from the tick."""
     relative: tuple[Anchor, ...] = ()
     """Absolute action channels that are learned as differences from the state at the tick."""
+    places: tuple[SlotPlace, ...] = ()
+    """The places of the slots of each layer; empty where they are not known."""
+
+    @property
+    def layers(self) -> int:
+        """How many layers the slots are of, with and without norm; each has all `places`."""
+        return self.slots // len(self.places) if self.places else 1
+
+    @property
+    def statistics_of(self) -> tuple[int, ...]:
+        """For each slot the index of its statistics."""
+        return shared_statistics(self.places, self.layers) if self.places else (*range(self.slots),)
 
     @property
     def kinds(self) -> tuple[Kind, ...]:
@@ -179,7 +237,7 @@ class PolicyShape:
         expanded = expanded_names([""] * self.state_dim, self.kinds)
         learned = {"relative": (self.action_dim,)} if self.relative else {}
         return {
-            "features": (self.slots, self.feature_dim),
+            "features": (len({*self.statistics_of}), self.feature_dim),
             "sensor": (self.sensor_channels,),
             "state": (len(expanded),),
             "action": (self.action_dim,),

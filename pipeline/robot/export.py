@@ -394,7 +394,7 @@ def _drawn(
     checkpoint: PolicyCheckpoint, stream: str, rows: int, rng: np.random.Generator
 ) -> NDArray[np.float64]:
     """Random values (row, slot or reading, channel) of a stream around its training mean."""
-    statistics, shape = getattr(checkpoint.normalization, stream), checkpoint.shape
+    statistics, shape = checkpoint.statistics(stream), checkpoint.shape
     lengths = {"sensor": checkpoint.params.sensor_window, "state": checkpoint.params.state_readings}
     spread = statistics.std
     if stream == "state":

@@ -45,7 +45,13 @@ from pipeline.policy.checkpoint import (
     check_policy,
 )
 from pipeline.policy.normalization import Normalization
-from pipeline.policy.shape import PolicyShape, channel_kinds, find_anchors, find_relative
+from pipeline.policy.shape import (
+    PolicyShape,
+    channel_kinds,
+    find_anchors,
+    find_relative,
+    slot_places,
+)
 from pipeline.store import FeatureStore, build_lock
 from pipeline.train.training_data import list_differences, source_of
 
@@ -298,6 +304,7 @@ def policy_shape(
         state_kinds=channel_kinds(state["names"], state["units"]) if normalization.state else (),
         anchors=find_anchors(action, known_state, anchor),
         relative=find_relative(action, known_state) if action_form == "relative" else (),
+        places=slot_places(store.attrs["slots"][: store.feature_shape[0]]),
     )
 
 

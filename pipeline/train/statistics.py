@@ -20,7 +20,14 @@ from pipeline.base.source import CLOCK_SLACK_S
 from pipeline.policy.attention import right_aligned
 from pipeline.policy.normalization import Block, ChannelStatistics, Normalization, fit_channels
 from pipeline.policy.robot_state import RelativeActions, expand
-from pipeline.policy.shape import PolicyShape, channel_kinds, expanded_names, told_deltas
+from pipeline.policy.shape import (
+    PolicyShape,
+    channel_kinds,
+    expanded_names,
+    shared_statistics,
+    slot_places,
+    told_deltas,
+)
 from pipeline.store import Batch, FeatureStore, place
 from pipeline.train.batches import Ticks, Windows, evenly
 
@@ -50,8 +57,9 @@ def fit_normalization(
     """Statistics per channel over the training `ticks` and the readings before them.
 
     Features: over the VL rows that these ticks use, each once, with all variants together, so
-    (slot, dim). Sensor: over the readings from each episode's start to its last tick. States: as a
-    policy takes them (`state_channels.expand`), over the windows of at most 16,384 evenly spaced
+    (slot, dim), or fewer where slots share them (`shared_statistics`). Sensor: over the readings
+    from each episode's start to its last tick. States: as a policy takes them
+    (`state_channels.expand`), over the windows of at most 16,384 evenly spaced
     ticks. A stream that no tick has gets no statistics. A spread far below what is usual for
     similar inputs is raised (`ChannelStatistics.floored`). Reads the store once, in chunks of about
     64 MB, a few at a time on `threads` threads (None: as many as torch has), with a bar on a
@@ -73,6 +81,11 @@ def fit_normalization(
         }
     features, sensor = fitted.get("vl"), fitted.get("sensor")
     if features is not None:
+        slots = store.attrs["slots"][: store.feature_shape[0]]
+        places = slot_places(slots)
+        index = shared_statistics(places, len(slots) // len(places))
+        if len({*index}) < len(index):
+            features = features.shared(index)
         usual = np.percentile(features.std, 75, axis=-1, keepdims=True)
         features = features.floored(usual)
     if sensor is not None:

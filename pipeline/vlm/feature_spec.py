@@ -96,7 +96,8 @@ def feature_spec(
     what = _read_digest(folder, vlm, len(ordered), digest_file) if remember else ""
     rendered = json.loads(remember(what, read) if remember else read())
     processor, dim = rendered["processor"], rendered["dim"]
-    slots = slots_of(vlm, rendered["layers"], ordered)
+    sides, patch = processor["image_size"], processor["patch_size"] * processor["merge_size"]
+    slots = slots_of(vlm, rendered["layers"], ordered, (sides[0] // patch, sides[1] // patch))
     document = {
         "extractor_version": EXTRACTOR_VERSION,
         "weights": _files_digest(weight_files(folder), digest_file),
@@ -124,8 +125,13 @@ def feature_shape(vlm: VLMParams, views: Sequence[str]) -> tuple[int, int]:
     Raises `VLMError` for a checkpoint that is neither a folder nor a hub id, also for a name whose
     parent is a folder here but that does not exist.
     """
-    slots = len(slots_of(vlm, _MANY_LAYERS, views))
-    if folder := folder_here(vlm.checkpoint):
+    folder, tokens = folder_here(vlm.checkpoint), _tokens_of_3b(vlm)
+    if folder and "tokens" in vlm.pooling:
+        from pipeline.vlm.processor import PixelSettings
+
+        tokens = PixelSettings.of(vlm).merged_grid
+    slots = len(slots_of(vlm, _MANY_LAYERS, views, tokens))
+    if folder:
         return slots, read_config(folder).text_config.hidden_size
     if folder_here(str(Path(vlm.checkpoint).parent)) or not could_be_hub_id(vlm.checkpoint):
         raise VLMError(
@@ -133,6 +139,12 @@ def feature_shape(vlm: VLMParams, views: Sequence[str]) -> tuple[int, int]:
             f"`{command('demo')}`."
         )
     return slots, _WIDTH_OF_3B
+
+
+def _tokens_of_3b(vlm: VLMParams) -> tuple[int, int]:
+    """Rows and columns of a view's image tokens in Qwen2.5-VL-3B; each shows 28 x 28 pixels."""
+    height, width = vlm.image_resize_height, vlm.image_resize_width
+    return round(height / 28), round(width / 28)
 
 
 def _read(folder: Path, vlm: VLMParams, views: int) -> dict[str, Any]:

@@ -41,10 +41,8 @@ def _tokens_of(slot: Slot, layout: TokenLayout) -> NDArray[np.int64]:
             return np.setdiff1d(every, layout.image_tokens())
         case "last":
             return every[-1:]
-        case "view_mean" | "grid":
+        case _:  # of a view: its mean, a grid's cell or a token
             return _view_tokens(slot, layout)
-        case unknown:
-            raise ValueError(f"unknown pooling {unknown!r}")
 
 
 def _view_tokens(slot: Slot, layout: TokenLayout) -> NDArray[np.int64]:

@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float, Int64, UInt8
 from torch import Tensor
 from transformers.masking_utils import create_causal_mask, create_sliding_window_causal_mask
 
-from pipeline.base.config import VLMParams
+from pipeline.base.config import Layer, VLMParams
 from pipeline.base.errors import NumericsError, VLMError
 from pipeline.base.machine import resolve_device
 from pipeline.vlm.collation import Collator, TokenBatch
@@ -33,8 +33,8 @@ _SHAPES = 64
 
 
 def layers_needed(slots: Iterable[Slot]) -> int:
-    """How many decoder layers must run for these slots."""
-    return max(slot.layer for slot in slots) + 1
+    """How many decoder layers must run for these slots; none where all are of the vision tower."""
+    return max(-1 if slot.layer == "vision" else slot.layer for slot in slots) + 1
 
 
 class Extractor:
@@ -58,7 +58,8 @@ class Extractor:
         self.model = model
         self._settings = settings
         # Every (layer, norm) has the same places, so one set of pooling weights is enough.
-        self._reads = tuple(dict.fromkeys((slot.layer, slot.norm) for slot in slots))
+        reads: list[tuple[Layer, bool]] = [(slot.layer, slot.norm) for slot in slots]
+        self._reads = tuple(dict.fromkeys(reads))
         places = slots[: len(slots) // len(self._reads)]
         self._tower = VisionTower(model.visual, settings.grid)
         self._collator = Collator(model, settings, places, self._tower, static=compiled)
@@ -130,18 +131,23 @@ class Extractor:
         """Run the layers and pool each output at once, so that none is kept in memory."""
         text = self.model.language_model
         rotary = text.rotary_emb(embedded, positions)
-        read: dict[tuple[int, bool], Tensor] = {}
-        hidden = embedded
-        for number, layer in enumerate(text.layers):
-            mask = masks[text.config.layer_types[number]]
-            hidden = layer(hidden, attention_mask=mask, position_embeddings=rotary, use_cache=False)
+        read: dict[tuple[Layer, bool], Tensor] = {}
+
+        def keep(output: Layer, hidden: Float[Tensor, "batch token dim"]) -> None:
             for key in self._reads:
-                if key[0] == number:
+                if key[0] == output:
                     tokens = text.norm(hidden) if key[1] else hidden
                     # Sums over thousands of tokens stay in float32, whatever autocast the caller
                     # uses.
                     with torch.autocast(tokens.device.type, enabled=False):
                         read[key] = pool(tokens, weights, real)
+
+        hidden = embedded
+        keep("vision", embedded)  # its slots read image tokens only
+        for number, layer in enumerate(text.layers):
+            mask = masks[text.config.layer_types[number]]
+            hidden = layer(hidden, attention_mask=mask, position_embeddings=rotary, use_cache=False)
+            keep(number, hidden)
         return torch.cat([read[key] for key in self._reads], dim=1)
 
 

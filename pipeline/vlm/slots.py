@@ -8,21 +8,24 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.base.config import Pooling, VLMParams
+from pipeline.base.config import GridPooling, Layer, Pooling, VLMParams
 from pipeline.base.errors import VLMError
+
+_WITH_TEXT = ("mean", "text_mean", "last")
+"""Poolings of tokens that the vision tower lacks."""
 
 
 @dataclass(frozen=True)
 class Slot:
     """One pooled vector of a row: its layer, whether it is normed, and its tokens."""
 
-    layer: int
-    """Index from the first layer; never negative."""
+    layer: Layer
+    """Index from the first layer, never negative; or the vision tower."""
     norm: bool
     pooling: str
     view: str | None = None
     cell: tuple[int, int] | None = None
-    """Row and column in the `grid` of a view."""
+    """Row and column in the `grid` of a view, or of a token."""
     grid: tuple[int, int] = (4, 4)
     """Rows and columns into which the cell's view is cut."""
 
@@ -36,21 +39,29 @@ class Slot:
         return document | ({"cell": list(self.cell)} if self.cell else {})
 
 
-def slots_of(vlm: VLMParams, layers: int, views: Sequence[str]) -> tuple[Slot, ...]:
+def slots_of(
+    vlm: VLMParams, layers: int, views: Sequence[str], tokens: tuple[int, int]
+) -> tuple[Slot, ...]:
     """The slots of `vlm` for a model with this many decoder layers and these views, in order.
 
-    Raises `VLMError` for a layer that the model lacks, for a repeated entry, and where no slot is
-    left.
+    `tokens` are the rows and columns of a view's image tokens. The vision tower has no final norm,
+    so `norms` does not multiply its slots. Raises `VLMError` for a layer that the model lacks, for
+    a repeated entry, for text of the vision tower, and where no slot is left.
     """
     for name, values in (("norms", vlm.norms), ("pooling", vlm.pooling)):
         if len(set(values)) < len(values):
-            raise VLMError(f"vlm.{name}: each may stand once, found {list(values)}")
+            raise VLMError(f"vlm.{name}: each may stand once, found {[*map(str, values)]}")
+    if "vision" in vlm.layers and (text := [p for p in vlm.pooling if p in _WITH_TEXT]):
+        raise VLMError(
+            f"vlm.pooling {', '.join(map(str, text))}: the vision tower of vlm.layers sees no "
+            "text. Use image_mean, view_mean, grid or tokens, or leave out the layer vision"
+        )
     slots = tuple(
         slot
         for layer in _resolved_layers(vlm.layers, layers)
-        for norm in vlm.norms
+        for norm in ((False,) if layer == "vision" else vlm.norms)
         for pooling in vlm.pooling
-        for slot in _slots_of(layer, norm, pooling, views, vlm.grid)
+        for slot in _slots_of(layer, norm, pooling, views, vlm.grid, tokens)
     )
     if not slots:
         raise VLMError(
@@ -60,14 +71,22 @@ def slots_of(vlm: VLMParams, layers: int, views: Sequence[str]) -> tuple[Slot, .
 
 
 def _slots_of(
-    layer: int, norm: bool, pooling: Pooling, views: Sequence[str], grid: tuple[int, int]
+    layer: Layer,
+    norm: bool,
+    pooling: Pooling,
+    views: Sequence[str],
+    grid: tuple[int, int],
+    tokens: tuple[int, int],
 ) -> list[Slot]:
-    if pooling == "view_mean":
-        return [Slot(layer, norm, pooling, view) for view in views]
-    if pooling == "grid":
+    name = str(pooling)
+    if name == "view_mean":
+        return [Slot(layer, norm, name, view) for view in views]
+    if isinstance(pooling, GridPooling) or name in ("grid", "tokens"):
+        grid = pooling.grid if isinstance(pooling, GridPooling) else grid
+        grid = tokens if name == "tokens" else grid
         cells = list(product(range(grid[0]), range(grid[1])))
-        return [Slot(layer, norm, pooling, view, cell, grid) for view in views for cell in cells]
-    return [Slot(layer, norm, pooling)]
+        return [Slot(layer, norm, name, view, cell, grid) for view in views for cell in cells]
+    return [Slot(layer, norm, name)]
 
 
 def slot_documents(slots: Sequence[Slot], variants: int) -> list[dict[str, Any]]:
@@ -80,18 +99,25 @@ def slot_documents(slots: Sequence[Slot], variants: int) -> list[dict[str, Any]]
 def slot_name(document: Mapping[str, Any]) -> str:
     """A short name for a slot document of a spec, without its variant."""
     cell = ",".join(map(str, document.get("cell") or ()))
-    layer = f"layer {document['layer']}{'' if document['norm'] else ' no norm'}"
+    layer = layer_name(document["layer"], document["norm"])
     return " ".join(filter(None, (layer, document["pooling"], document.get("view"), cell)))
 
 
-def _resolved_layers(layers: Sequence[int], count: int) -> tuple[int, ...]:
-    resolved = tuple(layer + count if layer < 0 else layer for layer in layers)
-    if not set(resolved) <= set(range(count)) or len(set(resolved)) < len(resolved):
+def layer_name(layer: Layer, norm: bool) -> str:
+    """A short name for the layer that a slot is taken from."""
+    return "vision tower" if layer == "vision" else f"layer {layer}{'' if norm else ', no norm'}"
+
+
+def _resolved_layers(layers: Sequence[Layer], count: int) -> tuple[Layer, ...]:
+    resolved: list[Layer] = [
+        layer + count if isinstance(layer, int) and layer < 0 else layer for layer in layers
+    ]
+    if not {*resolved} <= {*range(count), "vision"} or len({*resolved}) < len(resolved):
         raise VLMError(
             f"vlm.layers: expected {-count} to {count - 1} for a model of {count} decoder layers, "
-            f"each layer once, found {list(layers)}. Set vlm.layers to some of these"
+            f"or vision, each layer once, found {list(layers)}. Set vlm.layers to some of these"
         )
-    return resolved
+    return tuple(resolved)
 
 
 # Largest deviation of a number, relative to the root mean square of its slot, by the coarser of

@@ -147,10 +147,10 @@ def test_older_readings_tell_the_motion_and_nothing_else(build_policy, observe):
     other.state[:, -1] += 5.0
     assert not policy.act(other).equal(policy.act(seen))
     none = torch.zeros(2, dtype=torch.int64)
-    tokens = policy.encode("state", seen, none)
-    assert tokens.equal(policy.encode("state", replace(seen, state=seen.state + 5.0), none)), (
-        "a state that is dropped is missing, however old its readings are"
-    )
+    tokens = policy._encode_window("state", seen, none)
+    assert tokens.equal(
+        policy._encode_window("state", replace(seen, state=seen.state + 5.0), none)
+    ), "a state that is dropped is missing, however old its readings are"
 
 
 @pytest.mark.slow  # torch.export

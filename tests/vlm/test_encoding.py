@@ -45,7 +45,8 @@ class Reference:
         self.size = size
 
     def hidden(self, instruction, frames):
-        """Each layer's output (token, dim) before the norm, image-token mask, tokens an image."""
+        """The output (token, dim) of embeddings and of each layer before the norm, which tokens
+        are of images, and tokens an image."""
         content = [
             {"type": "text", "text": f"{instruction}\n"},
             *({"type": "image"} for _ in frames),
@@ -79,12 +80,12 @@ class Reference:
             )
         hook.remove()
         # The last of the hidden states is after the norm, the first is the embedding.
-        layers = [*out.hidden_states[1:-1], last[0]]
+        layers = [*out.hidden_states[:-1], last[0]]
         return [layer[0] for layer in layers], is_image[0], per_image
 
     def pooled(self, instruction, frames, layer, norm):
         layers, is_image, per_image = self.hidden(instruction, frames)
-        tokens = layers[layer]
+        tokens = layers[1 + layer]
         if norm:
             with torch.no_grad():
                 tokens = self.model.language_model.norm(tokens)
@@ -128,6 +129,31 @@ def test_batch_equals_single_rows_and_plain_transformers(extractor, rows, demo_c
         present = expected.any(dim=-1)
         assert torch.equal(valid[index], present)
         assert not features[index][~present].any()
+
+
+def test_tokens_and_the_vision_tower_are_those_of_plain_transformers(
+    extractor, rows, demo_checkpoint
+):
+    ours = extractor(pooling=[{"grid": [2, 1]}, "tokens"], layers=["vision", 1], norms=[False])
+    tokens, dim = 4 * 5, 128
+    assert len(ours.spec.slots) == 2 * (3 * 2 + 3 * tokens)
+    assert [slot.layer for slot in ours.spec.slots[::66]] == ["vision", 1]
+    reference = Reference(demo_checkpoint, ours.spec.image_size)
+    for row in rows[:4]:
+        features, valid = ours.model.encode([ours.preparer.prepare(*row)])
+        layers, is_image, per_image = reference.hidden(*row)
+        for index, hidden in enumerate((layers[0], layers[2])):  # as the tower gave it; after 1
+            ours_by_view = features[0].view(2, 66, dim)[index]
+            halves, alone = ours_by_view[:6].view(3, 2, dim), ours_by_view[6:].view(3, tokens, dim)
+            shown = iter(hidden[is_image].split(per_image or 1))
+            for view, name in enumerate(VIEWS):
+                expected = next(shown) if name in row[1] else torch.zeros(tokens, dim)
+                torch.testing.assert_close(alone[view], expected, atol=2e-5, rtol=1e-4)
+                mean = expected.view(2, -1, dim).mean(dim=1)
+                torch.testing.assert_close(halves[view], mean, atol=2e-5, rtol=1e-4)
+        assert torch.equal(valid[0], features[0].any(dim=-1))
+    alone = extractor(pooling=["tokens"], layers=["vision"], anew=True)
+    assert len(alone.model._model.language_model.layers) == 0  # the language model does not run
 
 
 def test_bfloat16_rows_agree_within_its_noise(extractor, rows):

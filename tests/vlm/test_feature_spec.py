@@ -68,6 +68,25 @@ def test_slots_go_by_layer_norm_pooling(spec_of):
     }
 
 
+def test_grids_tokens_and_the_tower_stand_side_by_side(spec_of):
+    spec = spec_of(
+        views=("View1",),
+        layers=["vision", 2],
+        norms=[True, False],
+        pooling=["view_mean", {"grid": [1, 2]}, "tokens"],
+    )
+    one = 1 + 2 + 4 * 5
+    assert len(spec.slots) == 3 * one  # the tower has no final norm
+    assert spec.slots[2].document() == {
+        "layer": "vision",
+        "norm": False,
+        "pooling": "grid 1x2",
+        "view": "View1",
+        "cell": [0, 1],
+    }
+    assert spec.slots[one - 1] == Slot("vision", False, "tokens", "View1", (3, 4), (4, 5))
+
+
 def test_variants_are_named_only_where_there_are_several(spec_of):
     """So that stores of one variant keep their digest, and what was extracted stays known."""
     one = spec_of()
@@ -218,6 +237,7 @@ def test_row_key_moves_with_spec_prompt_pixels_shape_and_view(spec_of, make_fram
         ({"layers": [4]}, r"expected -4 to 3 for a model of 4 decoder layers, .*found \[4\]"),
         ({"layers": [-1, 3]}, r"each layer once, found \[-1, 3\]"),
         ({"pooling": ["mean", "mean"]}, r"vlm\.pooling: each may stand once"),
+        ({"layers": ["vision"], "pooling": ["grid", "last"]}, "pooling last: the vision tower"),
         ({"adapter": "/nowhere"}, r"vlm\.adapter /nowhere: no such folder"),
     ],
 )

@@ -19,7 +19,7 @@ from pipeline.vlm.slots import Slot, slots_of
 )
 def test_grid_is_adaptive_average_pooling(grid, rows, columns, start):
     vlm = VLMParams(checkpoint="any", pooling=("grid",), grid=grid)
-    slots = slots_of(vlm, 1, ["View1"])
+    slots = slots_of(vlm, 1, ["View1"], (rows, columns))
     assert [slot.cell for slot in slots] == list(np.ndindex(*grid))
     layout = TokenLayout(start + rows * columns + 3, (("View1", start),), (rows, columns))
     tokens = torch.randn(layout.length, 5, generator=torch.Generator().manual_seed(0))

@@ -29,7 +29,9 @@ from pipeline.base.config.stage_one import (
     AugmentationParams,
     DataParams,
     ExtractParams,
+    GridPooling,
     InspectParams,
+    Layer,
     MediaLimits,
     Pooling,
     ProbeParams,
@@ -39,6 +41,7 @@ from pipeline.base.config.stage_one import (
 )
 from pipeline.base.config.training import (
     DiffusionParams,
+    FeatureEncoderParams,
     FinetuneParams,
     FlowMatchingParams,
     FusionStrategy,

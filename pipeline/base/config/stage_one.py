@@ -10,9 +10,24 @@ from pipeline.base.config.section import Globs, Output, PathOrName, Place, Secti
 from pipeline.base.hub import could_be_hub_id
 
 RecordingFormat = Literal["auto", "raw", "new", "old", "lerobot"]
-Pooling = Literal["mean", "image_mean", "text_mean", "view_mean", "grid", "last"]
+PoolingName = Literal["mean", "image_mean", "text_mean", "view_mean", "grid", "tokens", "last"]
 Dtype = Literal["float32", "float16", "bfloat16"]
 GridSide = Annotated[int, Field(ge=1, le=64)]
+Layer = int | Literal["vision"]
+"""Index of a decoder layer, or the vision tower."""
+
+
+class GridPooling(Section):
+    """A grid of its own size, so that several stand side by side."""
+
+    grid: tuple[GridSide, GridSide]
+    """Rows and columns."""
+
+    def __str__(self) -> str:
+        return f"grid {self.grid[0]}x{self.grid[1]}"
+
+
+Pooling = PoolingName | GridPooling
 
 
 def _workers(value: Any) -> Any:
@@ -159,13 +174,15 @@ class VLMParams(Section):
     """Pixels; rounded to a size that the processor accepts (640 -> 644)."""
     prompt: str = "{instruction}\n{images}\n{instruction}"
     """Template of one user turn. Attention is causal: images see only the text before them."""
-    layers: tuple[int, ...] = Field(default=(-1,), min_length=1, max_length=1000)
-    """Decoder layers whose output is taken; 0 is the first, -1 the last."""
+    layers: tuple[Layer, ...] = Field(default=(-1,), min_length=1, max_length=1000)
+    """Decoder layers whose output is taken; 0 is the first, -1 the last. vision: the output of the
+    vision tower; alone, the language model does not run."""
     norms: tuple[bool, ...] = Field(default=(True,), min_length=1, max_length=2)
     """Whether the model's final norm is applied to a layer's output; [true, false] stores both."""
-    pooling: tuple[Pooling, ...] = Field(default=("mean", "grid"), min_length=1, max_length=6)
+    pooling: tuple[Pooling, ...] = Field(default=("mean", "grid"), min_length=1, max_length=16)
     """Tokens that are averaged: mean: all. image_mean: of images. text_mean: of text. view_mean: of
-    each view. grid: of each cell of a grid over each view. last: only the last token."""
+    each view. grid: of each cell of a grid over each view; `{grid: [2, 2]}` has a size of its own.
+    tokens: each image token alone. last: only the last token."""
     grid: tuple[GridSide, GridSide] = (4, 4)
     """Rows and columns of the `grid` pooling."""
     variants: int = Field(default=1, ge=1, le=1000)

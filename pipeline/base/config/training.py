@@ -15,6 +15,26 @@ Weight = Annotated[float, Field(ge=0, le=1e6)]
 Share = Annotated[float, Field(ge=0, lt=1)]
 
 
+class FeatureEncoderParams(Section):
+    """How the slots of a VL row become the policy's tokens."""
+
+    kind: Literal["linear", "mean", "pooler"] = "linear"
+    """linear: a token for each slot, by one projection. mean: a token for each layer, the mean of
+    its slots. pooler: `queries` tokens that attend to all slots; its size does not depend on the
+    number of slots."""
+    queries: int = Field(default=8, ge=1, le=1024)
+    """For `pooler`: learned queries, each of which gives a token."""
+    dim: int = Field(default=128, ge=1, le=8192)
+    """For `pooler`: width of queries and slots."""
+    layers: int = Field(default=1, ge=1, le=16)
+    """For `pooler`: transformer layers of the queries, each with attention to the slots."""
+    heads: int = Field(default=4, ge=1, le=256)
+    """For `pooler`: must divide `dim`."""
+    state: bool = True
+    """For `pooler`: the robot's state moves the queries, through a gate that is 0 at first, so that
+    it directs where they look and never becomes what they find."""
+
+
 class SensorEncoderParams(Section):
     """Sizes of the sensor encoder; its parameters and cost are printed when training begins."""
 
@@ -169,6 +189,7 @@ class TrainHeadParams(Section):
     """Whether the policy sees the sensor."""
     robot_state_enabled: bool = True
     """Whether the policy sees the robot's state."""
+    feature_encoder: FeatureEncoderParams = FeatureEncoderParams()
     sensor_encoder: SensorEncoderParams = SensorEncoderParams()
     state_encoder: StateEncoderParams = StateEncoderParams()
     expert: ExpertParams = ExpertParams()

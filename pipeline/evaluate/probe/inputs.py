@@ -13,7 +13,7 @@ from tqdm import tqdm
 from pipeline.base.arrays import widen
 from pipeline.store import FeatureStore
 from pipeline.train.statistics import check_finite
-from pipeline.vlm.slots import Slot
+from pipeline.vlm.slots import Slot, layer_name
 
 Inputs = Float64[np.ndarray, "row _"]
 """The inputs or targets of a regression at each VL row or tick."""
@@ -45,7 +45,7 @@ class SlotName(Slot):
     @property
     def label(self) -> str:
         """The name in a few words."""
-        words = f"layer {self.layer}{'' if self.norm else ', no norm'}, {self.pooling}"
+        words = f"{layer_name(self.layer, self.norm)}, {self.pooling}"
         words += "" if self.view is None else f", {self.view}"
         return words + ("" if self.cell is None else f" cell {self.cell[0]},{self.cell[1]}")
 

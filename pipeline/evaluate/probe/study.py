@@ -179,6 +179,11 @@ def _targets(action: NDArray[np.float32], folds: ProbeFolds, horizon: int) -> In
     return ((chunks - statistics.mean) / statistics.scale).reshape(len(chunks), -1)
 
 
+def depth(name: SlotName) -> int:
+    """The layers that must run for a slot; the vision tower comes before the first."""
+    return -1 if name.layer == "vision" else name.layer
+
+
 def ranked(results: Sequence[ProbeResult]) -> list[ProbeResult]:
     """The results, the best first."""
     return sorted(results, key=lambda result: result.beside.mean, reverse=True)
@@ -213,7 +218,7 @@ def recommend(study: ProbeStudy) -> Recommendation | None:
         )
         chosen = min(
             [best, *tied],
-            key=lambda group: (len(group.slots), group.name.layer, -scores[group].mean),
+            key=lambda group: (len(group.slots), depth(group.name), -scores[group].mean),
         )
         return Recommendation(reading, best, chosen, tied)
     return None
