@@ -65,8 +65,25 @@ _TUNING = ("finetune.output={out}/tuned", "finetune.logs={out}/tuned-logs")
 LARGE_IMAGES = ("vlm.image_resize_height=224", "vlm.image_resize_width=392")
 _LARGE = (*LARGE_IMAGES, "extract.store={out}/large.zarr")
 
+_TWO_LAYERS = "vlm.layers=[1, -1]"
+SLOTS: dict[str, tuple[str, ...]] = {
+    "mean": ("vlm.pooling=[mean]",),
+    "grid 2x2": ("vlm.pooling=[{grid: [2, 2]}]",),
+    "tokens": ("vlm.pooling=[tokens]",),
+    "tokens of two layers": ("vlm.pooling=[tokens]", _TWO_LAYERS),
+    "tokens of the vision tower": ("vlm.pooling=[tokens]", "vlm.layers=[vision]"),
+}
+"""What a store keeps of the demo's recordings, beside the demo's own mean and grid."""
+
+
+def _store_of(name: str) -> Store:
+    settings = (*SLOTS[name], f"extract.store={{out}}/{name.replace(' ', '-')}.zarr")
+    return Store((("extract", settings),), settings)
+
+
 STORES = {
     "demo": Store(),
+    **{name: _store_of(name) for name in SLOTS},
     # 428 recordings, of which about 300 are trained on.
     "many": Store((("demo", _MANY), ("extract", _MANY)), _MANY),
     "tuned": Store((("finetune", _TUNING), ("extract", _TUNED)), _TUNED),
@@ -183,8 +200,15 @@ _RESIDUAL = {
     "pipeline.policy.policy.Policy.sample": _residual_sample,
 }
 
+_POOLER = ("train_head.feature_encoder.kind=pooler",)
+
 RECIPES = {
     AS_IT_IS: Recipe(),
+    # slots and their readers
+    **{name: Recipe(store=name) for name in ("mean", "grid 2x2", "tokens")},
+    "grid, pooler": Recipe(_POOLER),
+    "tokens, read as a mean": Recipe(("train_head.feature_encoder.kind=mean",), store="tokens"),
+    **{f"{name}, pooler": Recipe(_POOLER, store=name) for name in SLOTS if "tokens" in name},
     NOT_ANCHORED: Recipe(_TICK),
     # experts and fusions
     "diffusion": Recipe(_DIFFUSION),
@@ -281,6 +305,17 @@ TABLES = {
     "demonstrations": Table(tuple(f"{count} demonstrations" for count in (10, 30, 100, 300))),
     "many": Table(("300 demonstrations",), _LATER),
     "many, drawn": Table(tuple(f"{name}, 300 demonstrations" for name in _DRAWN)),
+    "slots": Table(
+        (
+            AS_IT_IS,
+            "mean",
+            "grid 2x2",
+            "tokens",
+            "tokens, read as a mean",
+            "grid, pooler",
+            *(f"{name}, pooler" for name in SLOTS if "tokens" in name),
+        )
+    ),
     "model": Table((AS_IT_IS, "tuned model")),
     "images": Table((AS_IT_IS, "larger images")),
     "learning": Table((AS_IT_IS, "horizon 16", "not averaged")),
