@@ -68,7 +68,7 @@ _LARGE = (*LARGE_IMAGES, "extract.store={out}/large.zarr")
 _TWO_LAYERS = "vlm.layers=[1, -1]"
 SLOTS: dict[str, tuple[str, ...]] = {
     "mean": ("vlm.pooling=[mean]",),
-    "grid 2x2": ("vlm.pooling=[{grid: [2, 2]}]",),
+    "grid 2x2": ("vlm.pooling=[{{grid: [2, 2]}}]",),
     "tokens": ("vlm.pooling=[tokens]",),
     "tokens of two layers": ("vlm.pooling=[tokens]", _TWO_LAYERS),
     "tokens of the vision tower": ("vlm.pooling=[tokens]", "vlm.layers=[vision]"),

@@ -12,6 +12,7 @@ from pipeline.base.channels import action_groups
 from pipeline.base.config import TrainHeadParams
 from pipeline.base.errors import ObservationError
 from pipeline.base.observation import Observation
+from pipeline.base.packing import unpack
 from pipeline.policy.ages import even_ages
 from pipeline.policy.shape import Axes, PolicyShape
 
@@ -117,7 +118,7 @@ def with_features(
     given = {name: getattr(observation, name) for name in Observation.__dataclass_fields__}
     row_of = observation.row_of.to(features.device)
     live, index = row_of >= 0, row_of.clamp(min=0)
-    cached = given["features"].to(features.dtype)
+    cached = unpack(given["features"]).to(features.dtype)
     given["features"] = torch.where(live[:, None, None], features[index], cached)
     given["slot_valid"] = torch.where(live[:, None], slot_valid[index], given["slot_valid"])
     return Observation(**given)

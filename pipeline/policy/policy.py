@@ -14,6 +14,7 @@ from torch.utils.flop_counter import FlopCounterMode
 from pipeline.base.config import TrainHeadParams
 from pipeline.base.errors import ObservationError
 from pipeline.base.observation import Observation
+from pipeline.base.packing import unpack
 from pipeline.base.source import CLOCK_SLACK_S
 from pipeline.policy.diffusion import DiffusionActionExpert
 from pipeline.policy.encoders import build_encoders
@@ -247,7 +248,7 @@ class Policy(Trainable):
         self, observation: Observation, valid: Tensor, state: Tensor | None
     ) -> Float[Tensor, "batch token width"]:
         """The tokens of the slots that `valid` marks; `state` is the state's token."""
-        values = self._normalized("features", observation.features)
+        values = self._normalized("features", unpack(observation.features))
         ages = observation.feature_age, observation.view_age
         return self.encoders["features"](values, valid, *ages, state)
 

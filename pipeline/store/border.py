@@ -140,7 +140,7 @@ class StoreAttributes(SourceDocument):
     """
 
     raw: dict[str, Any]
-    version: Literal[1] = Field(alias="schema")
+    version: Literal[1, 2] = Field(alias="schema")
     plan: Text
     slots: list[SlotDocument]
     sources: Annotated[list[Text], Field(min_length=1)]

@@ -53,7 +53,7 @@ from pipeline.store.border import (
     restore_command,
     start_over,
 )
-from pipeline.store.schema import SCHEMA
+from pipeline.store.schema import READABLE
 
 MERGED = "merge-"
 """Prefix of the plan of a store that was merged, not extracted."""
@@ -239,9 +239,9 @@ def find_attributes(root: Path) -> dict[str, Any]:
             actual = f"{described(root)} and no zarr.json that says so"
             then = f"It was left as it is: name another place, or, if it was one, {mend(root)}"
         raise StoreIncomplete(f"{root}: no finished store, found {actual}. {then}")
-    if attributes["schema"] != SCHEMA:
+    if attributes["schema"] not in READABLE:
         raise StoreMismatch(
-            f"{root / 'zarr.json'}: expected store schema {SCHEMA}, found "
+            f"{root / 'zarr.json'}: expected store schema {' or '.join(map(str, READABLE))}, found "
             f"{shown(attributes['schema'])}. Extract it again with this version."
         )
     return attributes

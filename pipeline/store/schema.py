@@ -1,9 +1,9 @@
 """What a store holds: its arrays, their dtypes and shapes, and how they lie in files.
 
 Every array is a plain zarr v3 array without compression, chunked along its first axis only, by a
-multiple of 4,096 rows. So the data of a chunk file begin at byte 0 and fill whole pages for any row
-width, and a 4-byte crc32c follows them. The file is both a zarr chunk and a flat block that can be
-mapped.
+multiple of 4,096 rows; features, whose rows may take megabytes, by as few rows as fill whole pages.
+So the data of a chunk file begin at byte 0 and fill whole pages for any row width, and a 4-byte
+crc32c follows them. The file is both a zarr chunk and a flat block that can be mapped.
 """
 
 import math
@@ -17,12 +17,17 @@ import numpy as np
 import zarr
 from zarr.codecs import BytesCodec, Crc32cCodec
 
+from pipeline.base.arrays import packed_size
 from pipeline.base.border import Border, shown
 from pipeline.base.differences import differences
 from pipeline.store.border import ArrayDocument, StoreAttributes, store_border
 
-SCHEMA = 1
+SCHEMA = 2
+READABLE = (1, 2)
+"""In 1, chunks of features have a multiple of 4,096 rows too."""
 ROW_MULTIPLE = 4096
+_PAGES = (2**16, 2**12)
+"""Bytes of a page: those of the largest, where a chunk then has at most `CHUNK_BYTES`."""
 CHUNK_BYTES = 64 * 2**20
 TRAILER_BYTES = 4
 KEY_BYTES = 16
@@ -78,13 +83,13 @@ class ArraySpec:
 
     @property
     def stored_dtype(self) -> str:
-        """The name of its number type; only bfloat16 has another dtype in numpy."""
-        return "bfloat16" if self.attributes else self.dtype.name
+        """The name of its number type, which may have another dtype in numpy."""
+        return self.attributes.get("dtype", self.dtype.name)
 
     @property
     def attributes(self) -> dict[str, Any]:
         """The attributes of the zarr array."""
-        return {"dtype": "bfloat16"} if self.dtype == np.uint16 else {}
+        return _ENCODED.get(self.dtype.name, {}) if self.name == FEATURES else {}
 
     @property
     def row_bytes(self) -> int:
@@ -97,12 +102,22 @@ class ArraySpec:
         return self.shape[0] * self.row_bytes
 
     @property
+    def row_multiple(self) -> int:
+        """Rows of which a chunk has a multiple, so that it fills whole pages."""
+        if self.name != FEATURES or not self.row_bytes:
+            return ROW_MULTIPLE
+        multiples = [page // math.gcd(page, self.row_bytes) for page in _PAGES]
+        fitting = (rows for rows in multiples if rows * self.row_bytes <= CHUNK_BYTES)
+        return next(fitting, multiples[-1])
+
+    @property
     def chunk_rows(self) -> int:
         """Rows per chunk: about 64 MB for wide rows; a small array is one chunk."""
         if self.stored_chunk_rows is not None:
             return self.stored_chunk_rows
-        wide = max(1, CHUNK_BYTES // (max(1, self.row_bytes) * ROW_MULTIPLE)) * ROW_MULTIPLE
-        return min(wide, max(1, math.ceil(self.shape[0] / ROW_MULTIPLE)) * ROW_MULTIPLE)
+        multiple = self.row_multiple
+        wide = max(1, CHUNK_BYTES // (max(1, self.row_bytes) * multiple)) * multiple
+        return min(wide, max(1, math.ceil(self.shape[0] / multiple)) * multiple)
 
     @property
     def chunk_bytes(self) -> int:
@@ -214,13 +229,23 @@ ARRAY_NAMES = tuple(_ARRAYS)
 GROUPS = tuple(sorted({name.partition("/")[0] for name in ARRAY_NAMES}))
 
 
+_ENCODED: dict[str, dict[str, Any]] = {
+    "uint16": {"dtype": "bfloat16"},
+    "int8": {"dtype": "int8", "scales": "bfloat16 behind the codes, one for each 32"},
+    "uint8": {"dtype": "float8", "scales": "bfloat16 behind the codes (e4m3fn), one for all"},
+}
+"""What an array of features of a numpy dtype holds, besides plain numbers."""
+_HOLDS = {"bfloat16": "u2", "float8": "u1", "int8": "i1"}
+
+
 def arrays(sizes: Sizes, features_dtype: str, sensor_dtype: str) -> dict[str, ArraySpec]:
     """Every array of a store, by name, in the order of the contract."""
     lengths = {**vars(sizes), "episode_edge": sizes.episode + 1, "key_byte": KEY_BYTES}
-    chosen = {FEATURES: features_dtype, "sensor/values": sensor_dtype}
+    lengths["dim"] = packed_size(features_dtype, sizes.dim)
+    chosen = {FEATURES: _HOLDS.get(features_dtype, features_dtype), "sensor/values": sensor_dtype}
     specs: dict[str, ArraySpec] = {}
     for name, (code, *axes) in _ARRAYS.items():
-        dtype = np.dtype(code or chosen[name].replace("bfloat16", "u2")).newbyteorder("<")
+        dtype = np.dtype(code or chosen[name]).newbyteorder("<")
         specs[name] = ArraySpec(name, tuple(lengths[axis] for axis in axes), dtype)
     return specs
 
@@ -249,7 +274,10 @@ def read_spec(root: Path, name: str) -> ArraySpec:
 _FEW = 64
 """Up to this many chunk files, an array's folder is not counted here."""
 _MOST_SHOWN = 5
-_CHOSEN = {FEATURES: ("float32", "float16", "uint16"), "sensor/values": ("float32", "float16")}
+_CHOSEN = {
+    FEATURES: ("float32", "float16", *_ENCODED),
+    "sensor/values": ("float32", "float16"),
+}
 """The allowed types of arrays whose type a param sets."""
 
 
@@ -268,7 +296,7 @@ def array_of(document: dict[str, Any], name: str, where: Path | str, border: Bor
     rows = array.chunk_rows
     whole = max(1, math.ceil(spec.shape[0] / ROW_MULTIPLE)) * ROW_MULTIPLE
     most = max(ROW_MULTIPLE, _MOST_CHUNK_BYTES // max(1, spec.row_bytes))
-    if 0 < rows <= min(whole, most) and rows % ROW_MULTIPLE == 0:
+    if 0 < rows <= min(whole, most) and (rows % ROW_MULTIPLE) % spec.row_multiple == 0:
         spec = replace(spec, stored_chunk_rows=rows)
     if document != spec.document:
         first = [*differences(spec.document, document).items()][:_MOST_SHOWN]

@@ -19,6 +19,7 @@ from transformers.masking_utils import create_causal_mask, create_sliding_window
 from pipeline.base.config import Layer, VLMParams
 from pipeline.base.errors import NumericsError, VLMError
 from pipeline.base.machine import resolve_device
+from pipeline.base.packing import pack, scales
 from pipeline.vlm.collation import Collator, TokenBatch
 from pipeline.vlm.feature_spec import FeatureSpec
 from pipeline.vlm.loading import environment, load_model
@@ -201,7 +202,7 @@ class FrozenVLM:
         self._model = model
         self._extractor = Extractor(model, settings, spec.slots, compiled)
         self._spec = spec
-        self._storage_dtype = getattr(torch, spec.document["storage_dtype"])
+        self._storage_dtype: str = spec.document["storage_dtype"]
         self._compiled = compiled
         self._fitted: dict[TokenLayout, set[int]] = defaultdict(set)
         self.environment = environment(model) | ({"compiled": "true"} if compiled else {})
@@ -251,7 +252,7 @@ class FrozenVLM:
 
                 def compute() -> Float[Tensor, "batch slot dim"]:
                     # Padded rows are dropped, and features converted, before they leave the device.
-                    return self._extractor.features(batch)[: len(rows)].to(self._storage_dtype)
+                    return pack(self._extractor.features(batch)[: len(rows)], self._storage_dtype)
 
                 pending = Pending(compute, valid, self.device, self._check_finite)
             except RuntimeError as error:
@@ -274,9 +275,10 @@ class FrozenVLM:
         return [*rows, *[rows[-1]] * (full - len(rows))]
 
     def _check_finite(self, features: Float[Tensor, "batch slot dim"]) -> None:
-        least, most = torch.aminmax(features)  # one pass; both are NaN if any value is
+        numbers = scales(features)
+        least, most = torch.aminmax(numbers)  # one pass; both are NaN if any value is
         if not math.isfinite(least) or not math.isfinite(most):
-            bad = ~torch.isfinite(features).all(dim=-1)
+            bad = ~torch.isfinite(numbers).all(dim=-1)
             row, slot = (int(index) for index in bad.nonzero()[0])
             raise NumericsError(
                 f"row {row} of the batch, slot {self._spec.slots[slot].document()}: expected "

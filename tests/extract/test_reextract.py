@@ -81,7 +81,7 @@ class TestDeviations:
         slots = read_spec(Path(document["extract"]["store"]), "vl/features").shape[1]
 
         def change(row):
-            row[slots - 1] *= 1.01
+            row[slots - 1] *= 1.02
 
         overwrite(document, "vl/features", 11, change)
         found = again(document)

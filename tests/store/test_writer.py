@@ -481,6 +481,22 @@ class TestChunkRule:
         width=st.integers(1, 200_000),
         dtype=st.sampled_from(["u1", "f2", "f4", "f8"]),
     )
+    def test_chunks_of_features_are_whole_pages_and_never_huge(self, rows, width, dtype):
+        spec = ArraySpec("vl/features", (rows, 16, width), np.dtype(dtype))
+        assert spec.chunk_bytes % 4096 == 0
+        assert spec.chunk_rows <= 4096 or spec.chunk_bytes <= 64 * 2**20
+        least = spec.chunk_rows == spec.row_multiple
+        assert least or spec.chunk_bytes <= 64 * 2**20
+        assert 0 <= spec.chunk_count * spec.chunk_rows - rows < spec.chunk_rows or not rows
+        # All tokens of three views of 360 x 640 in float16.
+        tokens = ArraySpec("vl/features", (rows, 897, 2048), np.dtype("f2"))
+        assert tokens.chunk_bytes <= 64 * 2**20
+
+    @given(
+        rows=st.integers(0, 10**8),
+        width=st.integers(1, 200_000),
+        dtype=st.sampled_from(["u1", "f2", "f4", "f8"]),
+    )
     def test_chunks_are_multiples_of_4096_rows_of_about_64_mb(self, rows, width, dtype):
         spec = ArraySpec("x", (rows, width), np.dtype(dtype))
         assert spec.chunk_rows % 4096 == 0

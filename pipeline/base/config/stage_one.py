@@ -12,6 +12,7 @@ from pipeline.base.hub import could_be_hub_id
 RecordingFormat = Literal["auto", "raw", "new", "old", "lerobot"]
 PoolingName = Literal["mean", "image_mean", "text_mean", "view_mean", "grid", "tokens", "last"]
 Dtype = Literal["float32", "float16", "bfloat16"]
+StorageDtype = Dtype | Literal["float8", "int8"]
 GridSide = Annotated[int, Field(ge=1, le=64)]
 Layer = int | Literal["vision"]
 """Index of a decoder layer, or the vision tower."""
@@ -206,8 +207,9 @@ class ExtractParams(Section):
 
     store: Output = Path("cache_store/demo.zarr")
     """The store, whose name ends in .zarr; written once, then never modified."""
-    dtype: Dtype = "float32"
-    """Type of the stored features."""
+    dtype: StorageDtype = "float32"
+    """Type of the stored features. float8 and int8 take a quarter of float32, with scales of their
+    own; stages.probe with `probe.codecs` says what each loses."""
     sensor_dtype: Literal["float32", "float16"] = "float32"
     """Type of the stored sensor stream."""
     batch_size: Literal["auto"] | Annotated[int, Field(ge=1, le=10_000)] = "auto"
