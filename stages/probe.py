@@ -9,6 +9,8 @@ targets.csv and a page (report.html) into probe.output.
   python -m stages.probe                             as params.yaml stands
   python -m stages.probe --set probe.max_ticks=2000  that many ticks, evenly spread: a first look
 
+  python -m stages.probe --set 'probe.codecs=[float16, int8]'  and what fewer bytes would lose
+
 You can also --set probe.output (where the files go), probe.folds (groups of recordings, each
 predicted from the others), probe.repeats (how often these are dealt) and probe.horizon (ticks of
 the predicted action chunk).

@@ -49,7 +49,7 @@ def widen(values: NDArray[Any]) -> NDArray[Any]:
     """
     if values.dtype == np.uint16:
         return (values.astype(np.uint32) << 16).view(np.float32)
-    if values.dtype not in (np.int8, np.uint8):
+    if values.dtype.name not in ("int8", "uint8"):
         return values
     dim = packed_dim(values.dtype, values.shape[-1])
     codes = values[..., :dim]

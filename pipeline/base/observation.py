@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor
 
 
@@ -15,7 +15,8 @@ class Observation:
     stream has width 0.
     """
 
-    features: Float[Tensor, "batch slot dim"]
+    features: Shaped[Tensor, "batch slot _"]
+    """Numbers, or the codes of int8 or float8 (uint8) for `pipeline.base.packing.unpack`."""
     slot_valid: Bool[Tensor, "batch slot"]
     feature_age: Float[Tensor, " batch"]
     """Seconds since the newest frame of the features."""

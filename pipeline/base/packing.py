@@ -26,13 +26,13 @@ def pack(values: Float[Tensor, "*batch dim"], dtype: str) -> Stored:
         scale = (values.abs().amax(dim=-1, keepdim=True) / _LARGEST_FLOAT8).bfloat16()
         scaled = values / scale.float().clamp(min=torch.finfo(torch.float32).tiny)
         codes = scaled.clamp(-_LARGEST_FLOAT8, _LARGEST_FLOAT8).to(_FLOAT8)
-        return torch.cat([codes.view(torch.uint8), scale.view(torch.uint8)], dim=-1)
+        return torch.cat([codes.view(torch.uint8), _bytes(scale, torch.uint8)], dim=-1)
     dim = values.shape[-1]
     blocks = F.pad(values, (0, -dim % BLOCK)).unflatten(-1, (-1, BLOCK))
     scale = (blocks.abs().amax(dim=-1) / 127).bfloat16()
     divisor = scale.float().clamp(min=torch.finfo(torch.float32).tiny).unsqueeze(-1)
     codes = (blocks / divisor).nan_to_num(0.0).round().clamp(-127, 127).to(torch.int8)
-    return torch.cat([codes.flatten(-2)[..., :dim], scale.view(torch.int8)], dim=-1)
+    return torch.cat([codes.flatten(-2)[..., :dim], _bytes(scale, torch.int8)], dim=-1)
 
 
 def unpack(values: Stored) -> Float[Tensor, "*batch dim"]:
@@ -52,6 +52,10 @@ def scales(values: Stored) -> Stored:
     if values.is_floating_point():
         return values
     return values[..., _dim(values) :].contiguous().view(torch.bfloat16)
+
+
+def _bytes(scale: Tensor, dtype: torch.dtype) -> Tensor:
+    return scale.contiguous().view(dtype)
 
 
 def _dim(values: Stored) -> int:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from pipeline.evaluate.probe.inputs import SlotName
 from pipeline.evaluate.probe.study import ProbeResult, ProbeStudy, recommend
-from pipeline.evaluate.probe.tables import advice, notes, ranking
+from pipeline.evaluate.probe.tables import advice, codec_table, notes, ranking
 from pipeline.look.page.blocks import Picture, Report, Section, Text, next_steps
 from pipeline.look.page.style import canvas, draw_map
 from pipeline.vlm.slots import layer_name
@@ -40,6 +40,24 @@ def probe_report(study: ProbeStudy, store: str) -> Report:
                 "What predicts the action",
                 [Picture("probe", caption, partial(draw_gains, study)), ranking(study)]
                 + [Text(note) for note in notes(study)],
+            ),
+            *(
+                [
+                    Section(
+                        "What fewer bytes would lose",
+                        [
+                            codec_table(study),
+                            Text(
+                                "R2 of the features alone, less that of what is stored, with its "
+                                "95 % interval: where it holds 0, no loss is resolved. The error "
+                                "is the root mean square change of a number, in standard "
+                                "deviations of its channel."
+                            ),
+                        ],
+                    )
+                ]
+                if study.codecs
+                else []
             ),
             next_steps(
                 *advice(study).splitlines(),

@@ -131,6 +131,9 @@ class FeaturePooler(nn.Module):
     0 at first: it directs where they look, but the values are of the slots alone.
     """
 
+    index: Int[Tensor, "place 2"]
+    waves: Float[Tensor, "place wave"]
+
     def __init__(self, shape: PolicyShape, params: FeatureEncoderParams, state_dim: int) -> None:
         super().__init__()
         places, dim = shape.places, params.dim

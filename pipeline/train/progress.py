@@ -11,7 +11,8 @@ import numpy as np
 import torch
 from tqdm import tqdm
 
-from pipeline.base.config import TrainHeadParams
+from pipeline.base.commands import command
+from pipeline.base.config import TrainHeadParams, setting
 from pipeline.base.text import duration
 from pipeline.policy.observation import PolicyShape
 from pipeline.store import FeatureStore
@@ -142,6 +143,11 @@ def describe_data(
         f"split: {len(split.train)} training ticks, {len(split.val)} val, {len(split.test)} test "
         f"of {' + '.join(str(len(names)) for names in groups)} groups{cut}",
     ]
+    if (dtype := store.spec.get("storage_dtype")) in ("int8", "float8"):
+        lines.append(
+            f"features are stored in {dtype}: {command('probe', setting('probe.codecs', [dtype]))} "
+            "on a store in float32 says what that loses"
+        )
     if anchored := shape.anchored(store.streams["action"]["names"]):
         lines.append(f"anchored at the newest frame: {', '.join(anchored)}")
     if not len(split.test):

@@ -19,7 +19,7 @@ from transformers.masking_utils import create_causal_mask, create_sliding_window
 from pipeline.base.config import Layer, VLMParams
 from pipeline.base.errors import NumericsError, VLMError
 from pipeline.base.machine import resolve_device
-from pipeline.base.packing import pack, scales
+from pipeline.base.packing import Stored, pack, scales
 from pipeline.vlm.collation import Collator, TokenBatch
 from pipeline.vlm.feature_spec import FeatureSpec
 from pipeline.vlm.loading import environment, load_model
@@ -225,9 +225,7 @@ class FrozenVLM:
         """Where the model is."""
         return self._model.device
 
-    def encode(
-        self, rows: Sequence[PreparedRow]
-    ) -> tuple[Float[Tensor, "batch slot dim"], Bool[Tensor, "batch slot"]]:
+    def encode(self, rows: Sequence[PreparedRow]) -> tuple[Stored, Bool[Tensor, "batch slot"]]:
         """Features of each row in the storage dtype, and which slots are valid, both on the CPU.
 
         A slot whose view is missing is zero and invalid. A row's features do not depend on the
@@ -250,7 +248,7 @@ class FrozenVLM:
                 batch = self._extractor.collate(padded)
                 valid = self._extractor.valid(batch)[: len(rows)]
 
-                def compute() -> Float[Tensor, "batch slot dim"]:
+                def compute() -> Stored:
                     # Padded rows are dropped, and features converted, before they leave the device.
                     return pack(self._extractor.features(batch)[: len(rows)], self._storage_dtype)
 
@@ -274,7 +272,7 @@ class FrozenVLM:
         full = min((size for size in self._fitted[layout] if size >= len(rows)), default=len(rows))
         return [*rows, *[rows[-1]] * (full - len(rows))]
 
-    def _check_finite(self, features: Float[Tensor, "batch slot dim"]) -> None:
+    def _check_finite(self, features: Stored) -> None:
         numbers = scales(features)
         least, most = torch.aminmax(numbers)  # one pass; both are NaN if any value is
         if not math.isfinite(least) or not math.isfinite(most):
@@ -298,10 +296,10 @@ class Pending:
 
     def __init__(
         self,
-        compute: Callable[[], Float[Tensor, "batch slot dim"]],
+        compute: Callable[[], Stored],
         valid: Bool[Tensor, "batch slot"],
         device: torch.device,
-        check: Callable[[Float[Tensor, "batch slot dim"]], None],
+        check: Callable[[Stored], None],
     ) -> None:
         """Begin to `compute` features on `device` and to copy them to the CPU."""
         self._valid, self._check = valid, check
@@ -314,7 +312,7 @@ class Pending:
             self._features.copy_(features, non_blocking=True)
         self._copied = _event(device)
 
-    def result(self) -> tuple[Float[Tensor, "batch slot dim"], Bool[Tensor, "batch slot"]]:
+    def result(self) -> tuple[Stored, Bool[Tensor, "batch slot"]]:
         """Wait for the result of `FrozenVLM.encode`; raises like it."""
         if self._copied:
             self._copied.synchronize()

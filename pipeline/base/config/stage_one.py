@@ -322,6 +322,9 @@ class ProbeParams(Section):
     """Sensor readings before the tick; their mean, last value and spread are the inputs."""
     state_window: int = Field(default=100, ge=1, le=20_000)
     """State readings before the tick, used in the same way."""
+    codecs: tuple[StorageDtype, ...] = ()
+    """Also say what these values of `extract.dtype` would lose: the error of the numbers, and the
+    difference in R2. Run it on a store in float32."""
     threads: int = Field(default=2, ge=1, le=256)
     """Threads, each of which works on its own slot."""
     check_store: bool = True

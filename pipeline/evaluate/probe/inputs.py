@@ -1,6 +1,6 @@
 """The inputs of a regression at a tick: features of its row; past actions, state and sensor."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -17,6 +17,7 @@ from pipeline.vlm.slots import Slot, layer_name
 
 Inputs = Float64[np.ndarray, "row _"]
 """The inputs or targets of a regression at each VL row or tick."""
+Values = Float[np.ndarray, "row dim"]
 Folds = Int64[np.ndarray, "repeat row"]
 """The fold that holds each row or tick out, in each deal."""
 PAST_ACTIONS = 2
@@ -51,13 +52,18 @@ class SlotName(Slot):
 
 
 def read_slots(
-    store: FeatureStore, rows: Int64[np.ndarray, " row"], fold: Folds, slots: Sequence[int]
+    store: FeatureStore,
+    rows: Int64[np.ndarray, " row"],
+    fold: Folds,
+    slots: Sequence[int],
+    codec: Callable[[Values], Values] = lambda values: values,
 ) -> tuple[Inputs, Bool[np.ndarray, " row"]]:
     """These slots of the VL `rows` as inputs side by side, and where at least one is valid.
 
     `fold` is the fold that holds each row out. The slots share `WIDTH` inputs; a slot with more
-    channels is reduced to its main directions. An invalid slot gets its mean, which is 0.
-    Raises `NumericsError` on NaN or inf, naming the place.
+    channels is reduced to its main directions. An invalid slot gets its mean, which is 0. `codec`
+    changes the valid features (row, dim) of a slot first. Raises `NumericsError` on NaN or inf,
+    naming the place.
     """
     inputs: list[Inputs] = [np.empty((len(rows), 0))]
     valid = store.array("vl/slot_valid")[rows][:, list(slots)].astype(bool)
@@ -66,7 +72,7 @@ def read_slots(
             continue
         values = widen(store.array("vl/features")[rows[there], slot])
         check_finite(store, "vl", rows[there], f"slot {slot}", values)
-        reduced = reduce(values, fold[:, there], WIDTH // len(slots))
+        reduced = reduce(codec(values), fold[:, there], max(1, WIDTH // len(slots)))
         inputs.append(np.zeros((len(rows), reduced.shape[1])))
         inputs[-1][there] = reduced
     return np.concatenate(inputs, axis=1), valid.max(axis=1)

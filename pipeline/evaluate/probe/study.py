@@ -6,19 +6,30 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from pydantic import TypeAdapter
 from threadpoolctl import threadpool_limits
 from tqdm import tqdm
 
 from pipeline.base.config import ProbeParams
+from pipeline.base.packing import pack, unpack
 from pipeline.evaluate.figures import Figure
-from pipeline.evaluate.probe.inputs import Inputs, SlotName, past_actions, read_slots, summarize
+from pipeline.evaluate.probe.inputs import (
+    Inputs,
+    SlotName,
+    Values,
+    past_actions,
+    read_slots,
+    summarize,
+)
 from pipeline.evaluate.probe.ridge import ProbeFolds, ProbeScore, cross_validate, fold_by_recording
 from pipeline.policy.normalization import fit_channels
 from pipeline.store import FeatureStore
 from pipeline.train.statistics import check_finite
 
+_MOST_SINGLE = 300
+"""Most slots that are scored one by one."""
 _ROUNDING = 1e-9
 """A gain below this counts as none."""
 
@@ -50,6 +61,25 @@ class Known:
 
 
 @dataclass(frozen=True, eq=False)
+class CodecResult:
+    """What a value of `extract.dtype` would lose of a group of slots."""
+
+    of: ProbeResult
+    """The group as it is stored."""
+    codec: str
+    row_bytes: int
+    error: float
+    """Root mean square, over channels and rows, of the change of a number, in standard deviations
+    of its channel."""
+    alone: ProbeScore
+
+    @property
+    def difference(self) -> Figure:
+        """R^2 alone with this codec minus that of what is stored."""
+        return self.alone.gain(self.of.alone)
+
+
+@dataclass(frozen=True, eq=False)
 class ProbeStudy:
     """All results, and the baselines beside them."""
 
@@ -60,8 +90,9 @@ class ProbeStudy:
     known: tuple[Known, ...]
     """Past actions; then with state; then with sensor too, as far as the store has them."""
     slots: tuple[ProbeResult, ...]
-    """In the store's order."""
+    """In the store's order; of many hundred slots only those that are a group of their own."""
     groups: tuple[ProbeResult, ...]
+    codecs: tuple[CodecResult, ...] = ()
 
     @property
     def baseline(self) -> Known:
@@ -125,6 +156,20 @@ def probe(store: FeatureStore, params: ProbeParams) -> ProbeStudy:
             inputs, targets, folds, params.penalties, penalties_of if beside else ()
         )
 
+    def coded(group: ProbeResult, codec: str) -> CodecResult:
+        squares: list[float] = []
+
+        def change(values: Values) -> Values:
+            changed = unpack(pack(torch.from_numpy(values), codec)).float().numpy()
+            spread = np.maximum(values.std(axis=0), np.finfo(np.float32).tiny)
+            squares.append(float(np.mean(((changed - values) / spread) ** 2)))
+            return changed
+
+        inputs, _ = read_slots(store, rows, fold[:, first], group.slots, change)
+        row_bytes = pack(torch.zeros(len(group.slots), dim), codec).nbytes
+        error = float(np.sqrt(np.mean(squares)))
+        return CodecResult(group, codec, row_bytes, error, score(inputs[of_tick]))
+
     def result(own: tuple[int, ...]) -> ProbeResult:
         inputs, valid = read_slots(store, rows, fold[:, first], own)
         inputs = inputs[of_tick]
@@ -146,17 +191,22 @@ def probe(store: FeatureStore, params: ProbeParams) -> ProbeStudy:
             named = f"{before.name} + {name}" if known else name
             known.append(Known(named, before.inputs + block.shape[1], score(block, beside=True)))
             penalties_of.append((block, known[-1].score.penalties))
-        tasks = groups | singles  # a group of one slot is that slot
+        # A group of one slot is that slot. Of hundreds of slots, each alone would take hours.
+        tasks = groups | (singles if len(singles) <= _MOST_SINGLE else {})
         bar = tqdm(pool.map(result, tasks), "probing", len(tasks), leave=False, disable=None)
         results = {result.slots: result for result in bar}
+        pairs = [(results[own], codec) for own in groups for codec in params.codecs]
+        judged = pool.map(lambda pair: coded(*pair), pairs)
+        codecs = tuple(tqdm(judged, "codecs", len(pairs), leave=False, disable=None))
     return ProbeStudy(
         horizon=params.horizon,
         action_names=tuple(store.streams["action"]["names"]),
         folds=folds,
         mean_action=mean_action,
         known=tuple(known),
-        slots=tuple(results[own] for own in singles),
+        slots=tuple(results[own] for own in singles if own in results),
         groups=tuple(results[own] for own in groups),
+        codecs=codecs,
     )
 
 

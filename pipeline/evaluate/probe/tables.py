@@ -50,6 +50,12 @@ def metrics(study: ProbeStudy) -> dict[str, Any]:
             for result in ranked(study.groups)
         },
     }
+    for result in study.codecs:
+        document.setdefault("codecs", {}).setdefault(result.of.name.label, {})[result.codec] = {
+            "row_bytes": result.row_bytes,
+            "error_std": result.error,
+            "difference": result.difference.document("r2"),
+        }
     advised = recommend(study)
     if advised is not None:
         document["recommended"] = {
@@ -78,6 +84,22 @@ def ranking(study: ProbeStudy) -> Table:
     return Table(heads, [[row[0], row[5], row[4], row[3], row[1], row[2]] for row in rows])
 
 
+def codec_table(study: ProbeStudy) -> Table:
+    """What each codec would lose of each group, the fewest bytes last."""
+    rows = [
+        [
+            result.codec,
+            result.of.name.label,
+            result.difference.text("+"),
+            f"{result.error:.2g}",
+            f"{result.row_bytes:,}",
+        ]
+        for result in sorted(study.codecs, key=lambda result: -result.row_bytes)
+    ]
+    heads = ["extract.dtype", "what is read", "R2 less than stored", "error [std]", "bytes a row"]
+    return Table(heads, rows)
+
+
 def notes(study: ProbeStudy) -> list[str]:
     """What a reader of the ranking has to know."""
     single = sum(result.name != result.name.group for result in study.slots)
@@ -99,7 +121,8 @@ def notes(study: ProbeStudy) -> list[str]:
 
 def table(study: ProbeStudy) -> str:
     """The ranking and its notes, for a terminal."""
-    return "\n".join([*ranking(study).text(), *notes(study)])
+    codecs = codec_table(study).text() if study.codecs else ()
+    return "\n".join([*ranking(study).text(), *notes(study), *codecs])
 
 
 def advice(study: ProbeStudy) -> str:

@@ -54,6 +54,31 @@ def test_the_slot_that_carries_the_action_is_first(tiny_store: Make, tmp_path: P
         assert abs(other.alone.mean) < 0.1
 
 
+def test_a_codec_is_judged_by_its_error_and_by_what_it_costs(
+    tiny_store: Make, tmp_path: Path
+) -> None:
+    store = FeatureStore.open(tiny_store(tmp_path, episodes=24, slots=5))
+    features = store.array("vl/features")
+    features[..., 3] *= 1000  # as the few huge channels of large models
+    weights = np.random.default_rng(1).normal(size=(8, 4)).astype(np.float32)
+    small = features / features.std(axis=(0, 1))
+    store.array("tick/action")[:, :4] = small[store.array("tick/vl_row"), 3] @ weights
+    study = probed(store, horizon=1, codecs=("float32", "float8", "int8"))
+    groups = len(study.groups)
+    float32, float8, int8 = (study.codecs[at::3] for at in range(3))
+    assert groups == len(float32) and all(result.error == 0 for result in float32)
+    assert all(result.difference.value == 0 for result in float32)
+    assert [result.row_bytes for result in (*float32, *float8)] == groups * [5 * 8 * 4] + groups * [
+        5 * (8 + 2)
+    ]
+    # Scales of their own keep float8 within its codes; int8 shares a scale with the huge channel.
+    assert all(0 < result.error < 0.06 for result in float8)
+    assert all(result.error > 0.5 for result in int8)
+    assert all(result.difference.value < -0.2 for result in int8)
+    assert metrics(study)["codecs"][study.groups[0].name.label]["int8"]["row_bytes"] == 50
+    assert "R2 less than stored" in table(study)
+
+
 @pytest.fixture
 def plain(nested: Make, limited: Make, r2_by_fold: Make) -> Make:
     """`plain(study, store, slots, score)`: the score is that of ridge regression on the rows.

@@ -1,0 +1,93 @@
+"""A store in int8 or float8 is read, checked, continued and trained from like any other."""
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from pipeline.base.arrays import widen
+from pipeline.base.config import Params
+from pipeline.base.packing import unpack
+from pipeline.extract.reextract import reextract
+from pipeline.policy.policy import Policy
+from pipeline.store import FeatureStore
+from pipeline.store.verification import verify
+from pipeline.train.batches import Windows
+from pipeline.train.run import policy_shape
+from pipeline.train.statistics import fit_normalization
+from tests.extract.conftest import run
+
+SLOTS = {"pooling": [{"grid": [1, 2]}, "tokens"], "layers": ["vision", -1], "norms": [False]}
+
+
+@pytest.fixture(scope="module")
+def stores(make_document, tmp_path_factory) -> dict[str, tuple[Params, FeatureStore]]:
+    """The same recordings in three storage dtypes."""
+    document = make_document(tmp_path_factory.mktemp("packed"))
+    found = {}
+    for dtype in ("float32", "int8", "float8"):
+        place = Path(document["extract"]["store"]).with_name(f"{dtype}.zarr")
+        extract = document["extract"] | {"store": str(place), "dtype": dtype}
+        changed = document | {"extract": extract, "vlm": document["vlm"] | SLOTS}
+        params = Params.model_validate(changed)
+        run(params)
+        found[dtype] = params, FeatureStore.open(place)
+    return found
+
+
+@pytest.mark.parametrize("dtype", ["int8", "float8"])
+def test_rows_are_those_of_float32_within_a_code(stores, dtype):
+    (_, whole), (params, store) = stores["float32"], stores[dtype]
+    assert store.feature_shape == whole.feature_shape
+    held = store.array("vl/features")
+    assert held.dtype.name == {"int8": "int8", "float8": "uint8"}[dtype]
+    assert held.nbytes < 0.3 * whole.array("vl/features").nbytes
+    numbers, exact = widen(held), whole.array("vl/features")
+    largest = np.abs(exact).max(axis=-1, keepdims=True)
+    assert (np.abs(numbers - exact) <= largest / (100 if dtype == "int8" else 15)).all()
+    assert verify(store.path, 1).sound
+    some = params.model_copy(update={"verify": params.verify.model_copy(update={"reextract": 4})})
+    again = reextract(store.path, some, lambda line: None)
+    assert not again.beyond and len(again.deviations) == 4
+
+
+@pytest.mark.parametrize("dtype", ["int8", "float8"])
+def test_a_batch_hands_out_codes_and_the_policy_reads_numbers(stores, dtype):
+    _, store = stores[dtype]
+    ticks, windows = np.arange(store.ticks), Windows(4, 5, 5)
+    batch = store.gather(ticks[:6], 4, 5, 5)
+    assert batch.features.dtype == {"int8": torch.int8, "float8": torch.uint8}[dtype]
+    normalization = fit_normalization(store, ticks, windows)
+    shape = policy_shape(store, normalization)
+    assert normalization.features is not None
+    # The tokens of a layer and view share their statistics.
+    assert normalization.features.mean.shape == (2 * (2 * 2 + 2), shape.feature_dim)
+    params = stores[dtype][0].train_head.model_copy(update={"horizon": 4})
+    policy = Policy(params, shape, normalization).eval()
+    read = policy.act(batch)
+    batch.features = unpack(batch.features)
+    torch.testing.assert_close(policy.act(batch), read)
+
+
+def test_a_part_of_a_packed_store_is_taken_over(stores, tmp_path):
+    params, store = stores["int8"]
+    copy = tmp_path / "copy.zarr"
+    shutil.copytree(store.path, copy)
+    longer = params.model_copy(
+        update={
+            "extract": params.extract.model_copy(update={"store": copy}),
+            "data": params.data.model_copy(update={"vlm_reuse_count": 2}),
+        }
+    )
+    report, _ = run(longer)
+    assert report.taken > 0
+    known = dict(zip(map(bytes, store.array("vl/key")), store.array("vl/features"), strict=True))
+    taken = FeatureStore.open(copy)
+    same = [
+        np.array_equal(known[bytes(key)], row)
+        for key, row in zip(taken.array("vl/key"), taken.array("vl/features"), strict=True)
+        if bytes(key) in known
+    ]
+    assert same and all(same)
