@@ -19,7 +19,8 @@ from hypothesis import strategies as st
 from pipeline.base.errors import StoreIncomplete, StoreMismatch
 from pipeline.store import FeatureStore, episode_name, part_path, place
 from pipeline.store.chunks import write_seal
-from pipeline.store.schema import ARRAY_NAMES
+from pipeline.store.schema import ARRAY_NAMES, ArraySpec, read_spec
+from tests.conftest import write_tiny_store
 
 
 @pytest.fixture(scope="module")
@@ -44,9 +45,24 @@ class TestPlainReaders:
             metadata = array.metadata.to_dict()
             assert [codec["name"] for codec in metadata["codecs"]] == ["bytes", "crc32c"]
             assert len(metadata["dimension_names"]) == len(metadata["shape"])
-            assert metadata["chunk_grid"]["configuration"]["chunk_shape"][0] % 4096 == 0
+            rows = metadata["chunk_grid"]["configuration"]["chunk_shape"][0]
+            assert (rows if name != "vl/features" else rows * mapped[:1].nbytes) % 4096 == 0
         lazy = dask.array.from_zarr(str(path), component="sensor/values")
         assert np.array_equal(lazy.compute(), store.array("sensor/values"))
+
+    def test_a_store_of_schema_1_opens_with_its_larger_chunks(
+        self, path, store, tmp_path, monkeypatch
+    ):
+        with monkeypatch.context() as earlier:
+            earlier.setattr(ArraySpec, "row_multiple", 4096)
+            earlier.setattr("tests.conftest.SCHEMA", 1)
+            old = write_tiny_store(tmp_path)
+        opened = FeatureStore.open(old)
+        assert opened.attrs["schema"] == 1
+        assert read_spec(old, "vl/features").chunk_rows == 4096
+        assert read_spec(path, "vl/features").chunk_rows == 2048
+        for name in ARRAY_NAMES:
+            assert np.array_equal(opened.array(name), store.array(name), equal_nan=True), name
 
     def test_bfloat16_is_its_bits_with_an_attribute(self, tiny_store, tmp_path):
         path = tiny_store(tmp_path, dtype="bfloat16")
