@@ -143,7 +143,7 @@ def warm(store: FeatureStore) -> None:
 
 def wide_rows(store: FeatureStore, ticks: Index, wanted: tuple[int, int, int]) -> dict[str, Index]:
     """The rows that the wide fields of a batch without padding are made of."""
-    _, selection = store.select(ticks, (*wanted, None, None), (0, 0.0, 0.0), None, None)
+    _, selection = store.select(ticks, (*wanted, None, None, 1), (0, 0.0, 0.0), None, None)
     lengths = {"sensor": wanted[1], "state": wanted[2]}
     windows = {
         name: (window.end[:, None] + np.arange(-lengths[name], 0)).ravel()

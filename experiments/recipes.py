@@ -71,6 +71,9 @@ SLOTS: dict[str, tuple[str, ...]] = {
     "grid 2x2": ("vlm.pooling=[{{grid: [2, 2]}}]",),
     "tokens": ("vlm.pooling=[tokens]",),
     "tokens of two layers": ("vlm.pooling=[tokens]", _TWO_LAYERS),
+    "int8": ("extract.dtype=int8",),
+    "float8": ("extract.dtype=float8",),
+    "tokens in int8": ("vlm.pooling=[tokens]", "extract.dtype=int8"),
     "tokens of the vision tower": ("vlm.pooling=[tokens]", "vlm.layers=[vision]"),
 }
 """What a store keeps of the demo's recordings, beside the demo's own mean and grid."""
@@ -206,6 +209,8 @@ RECIPES = {
     AS_IT_IS: Recipe(),
     # slots and their readers
     **{name: Recipe(store=name) for name in ("mean", "grid 2x2", "tokens")},
+    **{name: Recipe(store=name) for name in ("int8", "float8")},
+    "history of 3": Recipe(("train_head.feature_history=3",)),
     "grid, pooler": Recipe(_POOLER),
     "tokens, read as a mean": Recipe(("train_head.feature_encoder.kind=mean",), store="tokens"),
     **{f"{name}, pooler": Recipe(_POOLER, store=name) for name in SLOTS if "tokens" in name},
@@ -316,6 +321,7 @@ TABLES = {
             *(f"{name}, pooler" for name in SLOTS if "tokens" in name),
         )
     ),
+    "bytes": Table((AS_IT_IS, "int8", "float8", "tokens in int8, pooler", "history of 3")),
     "model": Table((AS_IT_IS, "tuned model")),
     "images": Table((AS_IT_IS, "larger images")),
     "learning": Table((AS_IT_IS, "horizon 16", "not averaged")),

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor, nn
 
 from pipeline.base.config import FusionStrategy, ModelType, TrainHeadParams, TuningParams, VLMParams
-from pipeline.base.errors import ObservationError
+from pipeline.base.errors import ConfigError, ObservationError
 from pipeline.base.observation import Observation
 from pipeline.policy.live_policy import LivePolicy
 from pipeline.policy.normalization import ChannelStatistics, Normalization
@@ -103,6 +103,8 @@ class QwenVLAUnified(LivePolicy[LiveVLM]):
         tuned = TuningParams.model_validate({"method": finetune_vl, **lora, **(tuning or {})})
         kinds = {"model_type": model_type, "fusion_strategy": fusion_strategy}
         params = TrainHeadParams.model_validate({**kinds, **_with_seed_parts(head)})
+        if params.feature_history > 1:
+            raise ConfigError("feature_history: a live model gives one row a tick, set it to 1")
         names = tuple(sorted(views))
         slots, width = feature_shape(vlm_params, names)
         groups = _ACTION_GROUPS if action_dim == len(_ACTION_GROUPS) else ("other",) * action_dim

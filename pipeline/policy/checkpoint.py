@@ -110,6 +110,7 @@ class PolicyDocument(SourceDocument):
             "shape.action_groups": (len(shape.action_groups), {shape.action_dim}),
             "shape.state_kinds": (len(shape.state_kinds), {0, shape.state_dim}),
             "shape.slots": (shape.slots, {len(plain)}),
+            "shape.history": (shape.history, {self.params.train_head.feature_history}),
             "shape.feature_dim": (shape.feature_dim, {spec.dim}),
             "shape.places": (
                 shape.places,
@@ -190,14 +191,16 @@ class PolicyCheckpoint:
         return policy.to(device).eval()
 
     def statistics(self, stream: str) -> ChannelStatistics:
-        """The training statistics of a stream, for features those of each slot (slot, dim)."""
+        """The training statistics of a stream, for features those of a row's slots (slot, dim)."""
         fitted: ChannelStatistics | None = getattr(self.normalization, stream)
         assert fitted is not None, "a policy has statistics of every stream that it sees"
         return fitted.at(self.shape.statistics_of) if stream == "features" else fitted
 
     def typical(self, stream: str) -> NDArray[np.float64]:
-        """The training mean of a stream: a reading (channel,), or features (slot, dim)."""
+        """The training mean of a stream: a reading (channel,), or the features of a sample."""
         statistics = self.statistics(stream)
+        if stream == "features":
+            return np.tile(statistics.mean, (self.shape.history, 1))
         if stream != "state":
             return statistics.mean
         return np.array(typical_state(statistics.mean.tolist(), self.shape.kinds))

@@ -73,7 +73,7 @@ class FeatureEncoder(nn.Module):
 
 
 class MeanFeatureEncoder(FeatureEncoder):
-    """As `FeatureEncoder`, of one slot a layer: the mean of that layer's valid slots."""
+    """As `FeatureEncoder`, of one slot a layer and row: the mean of its valid slots."""
 
     def __init__(self, layers: int, feature_dim: int, views: int = 0) -> None:
         super().__init__(layers, feature_dim, views=views)
@@ -124,8 +124,8 @@ class SlotAttention(nn.Module):
 class FeaturePooler(nn.Module):
     """Learned queries that attend to the slots: features (batch, slot, dim) -> (batch, query, dim).
 
-    The slots of a place in all layers become one key, by a learned mixture of the layers. A key
-    knows where in which view it looks, by Fourier features of its cell's centre (Tancik et al.
+    The slots of a place in all layers of a row become one key, by a learned mixture of the layers.
+    A key knows its row and where in which view it looks, by Fourier features of its cell's centre (Tancik et al.
     2020) and embeddings of view and pooling, so that parameters do not grow with the number of
     slots. Keys without a valid slot are masked. The state moves the queries through a gate that is
     0 at first: it directs where they look, but the values are of the slots alone.
@@ -137,7 +137,8 @@ class FeaturePooler(nn.Module):
     def __init__(self, shape: PolicyShape, params: FeatureEncoderParams, state_dim: int) -> None:
         super().__init__()
         places, dim = shape.places, params.dim
-        self.layers = shape.layers
+        self.rows_and_layers = shape.history, shape.layers
+        self.row = nn.Embedding(shape.history, dim)
         self.mixture = nn.Parameter(torch.zeros(shape.layers))
         self.squeeze = nn.Linear(shape.feature_dim, dim)
         kinds = [
@@ -170,14 +171,16 @@ class FeaturePooler(nn.Module):
     ) -> Float[Tensor, "batch query width"]:
         """Encode; nothing of a slot that is not valid reaches the output or a gradient."""
         features = features.masked_fill(~slot_valid.unsqueeze(-1), 0.0)
+        by_layer = (*self.rows_and_layers, -1)
         mixed = torch.einsum(
-            "blpd,l->bpd", features.unflatten(1, (self.layers, -1)), self.mixture.softmax(dim=0)
+            "brlpd,l->brpd", features.unflatten(1, by_layer), self.mixture.softmax(dim=0)
         )
         place = self.where(self.waves)
         for embedding, index in zip(self.kinds, self.index.T, strict=True):
             place = place + embedding(index)
-        keys = self.key_norm(self.squeeze(mixed) + place)
-        present = slot_valid.unflatten(1, (self.layers, -1)).any(dim=1)
+        place = place + self.row.weight.unsqueeze(1)
+        keys = self.key_norm(self.squeeze(mixed) + place).flatten(1, 2)
+        present = slot_valid.unflatten(1, by_layer).any(dim=2).flatten(1)
         missing = ~present.any(dim=1, keepdim=True)
         steer = 0.0
         if self.steer is not None and state is not None:
@@ -432,14 +435,15 @@ def build_feature_encoder(
     Raises `ConfigError` where the shape does not say which slots are of one layer.
     """
     if params.kind == "linear":
-        return FeatureEncoder(shape.slots, shape.feature_dim, views=shape.views)
+        slots = shape.slots * shape.history
+        return FeatureEncoder(slots, shape.feature_dim, views=shape.views)
     if not shape.places:
         raise ConfigError(
             f"train_head.feature_encoder.kind {params.kind}: expected to know the layer and place "
             "of each slot, which only a store says. Train from a store, or use kind: linear."
         )
     if params.kind == "mean":
-        return MeanFeatureEncoder(shape.layers, shape.feature_dim, shape.views)
+        return MeanFeatureEncoder(shape.layers * shape.history, shape.feature_dim, shape.views)
     return FeaturePooler(shape, params, state_dim)
 
 

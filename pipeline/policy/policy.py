@@ -139,7 +139,7 @@ class Policy(Trainable):
         self.encoders, tokens = build_encoders(params, shape)
         statistics = {name: getattr(normalization, name) for name in self.encoders}
         if "features" in statistics:
-            statistics["features"] = statistics["features"].at(shape.statistics_of)
+            statistics["features"] = statistics["features"].at(shape.statistics_of * shape.history)
         self.normalizers = nn.ModuleDict({n: Normalizer(fit) for n, fit in statistics.items()})
         self.action_normalizer = Normalizer(normalization.relative or normalization.action)
         expert = params.expert
@@ -325,7 +325,7 @@ def flop_table(policy: Policy) -> list[tuple[str, int]]:
     frozen = deepcopy(policy).requires_grad_(False).eval()
     params, shape = frozen.params, frozen.shape
     sizes = {
-        "features": (shape.slots, shape.feature_dim),
+        "features": (shape.slots * shape.history, shape.feature_dim),
         "sensor": (params.sensor_window, shape.sensor_channels),
         "state": (params.state_window, shape.state_dim),
     }

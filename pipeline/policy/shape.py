@@ -211,6 +211,8 @@ class PolicyShape:
     """Absolute action channels that are learned as differences from the state at the tick."""
     places: tuple[SlotPlace, ...] = ()
     """The places of the slots of each layer; empty where they are not known."""
+    history: Annotated[int, Field(ge=1, le=64)] = 1
+    """VL rows that a sample sees, each with all slots, the newest first."""
 
     @property
     def layers(self) -> int:
@@ -255,8 +257,8 @@ class PolicyShape:
     def stream_axes(self) -> dict[str, Axes]:
         """The axes behind the batch of each field of an `Observation` of this shape."""
         return {
-            "features": {"slot": self.slots, "dim": self.feature_dim},
-            "slot_valid": {"slot": self.slots},
+            "features": {"slot": self.slots * self.history, "dim": self.feature_dim},
+            "slot_valid": {"slot": self.slots * self.history},
             "feature_age": {},
             "view_age": {"view": self.views},
             # Windows of any length: readings are placed by their ages.

@@ -331,8 +331,11 @@ def golden_inputs(checkpoint: PolicyCheckpoint, policy: Policy) -> dict[str, Inp
     rows = checkpoint.golden
     if rows and "features" in policy.encoders:
         golden = random_inputs(checkpoint, policy, len(rows), seed=1)
-        golden["features"] = torch.from_numpy(np.stack([row.features for row in rows])).float()
-        golden["slot_valid"] = torch.from_numpy(np.stack([row.slot_valid for row in rows])).bool()
+        history = checkpoint.shape.history
+        features = np.stack([np.tile(row.features, (history, 1)) for row in rows])
+        valid = np.stack([np.tile(row.slot_valid, history) for row in rows])
+        golden["features"] = torch.from_numpy(features).float()
+        golden["slot_valid"] = torch.from_numpy(valid).bool()
         given["golden"] = golden
     return given
 
@@ -401,5 +404,7 @@ def _drawn(
         plain = iter(spread)  # expanded states begin with the plain channels
         spread = np.array([_TURN.get(kind) or next(plain) for kind in shape.kinds])
     mean = checkpoint.typical(stream)
+    if stream == "features":
+        spread = np.tile(spread, (shape.history, 1))
     size = mean.shape if stream == "features" else (lengths[stream], *mean.shape)
     return mean + spread * rng.standard_normal((rows, *size))

@@ -146,10 +146,24 @@ def older_than_trained(age_s: float, trained_age_s: float) -> bool:
 class RobotMemory:
     """The windows of one robot by stream, and its newest features."""
 
-    def __init__(self, windows: Mapping[str, ReadingWindow]) -> None:
+    def __init__(self, windows: Mapping[str, ReadingWindow], history: int = 1) -> None:
+        """With `history`, the policy sees the features of that many passes of the model."""
         self._windows = windows
-        self.features: SeenFeatures | None = None
+        self._seen: deque[SeenFeatures] = deque(maxlen=history)
         self.time_s = 0.0
+
+    @property
+    def features(self) -> SeenFeatures | None:
+        """The newest features; None until the first came."""
+        return self._seen[0] if self._seen else None
+
+    def forget_features(self) -> None:
+        """Forget all features: what follows belongs to another prompt."""
+        self._seen.clear()
+
+    @features.setter
+    def features(self, seen: SeenFeatures) -> None:
+        self._seen.appendleft(seen)
 
     @classmethod
     def of(cls, policy: "Policy") -> "RobotMemory":
@@ -159,7 +173,8 @@ class RobotMemory:
             "sensor": (params.sensor_window, shape.sensor_channels, params.sensor_reach_s),
             "state": (params.state_readings, shape.state_dim, params.state_reach_s),
         }
-        return cls({name: ReadingWindow(*size) for name, size in sizes.items() if size[1]})
+        windows = {name: ReadingWindow(*size) for name, size in sizes.items() if size[1]}
+        return cls(windows, shape.history)
 
     def sense(self, readings: Mapping[str, NDArray[Any]]) -> None:
         """Take the readings since the last tick, and `time` (1,) now, in s.
@@ -183,9 +198,11 @@ class RobotMemory:
             fields |= {name: values, f"{name}_valid": np.array(valid), f"{name}_age": ages}
         if (seen := self.features) is not None:
             ages = (self.time_s - seen.frame_time_s).astype(np.float32)
+            lacking = (self._seen.maxlen or 1) - len(self._seen)
+            rows = [*self._seen, *[self._seen[-1]] * lacking]  # as before an episode's first row
             fields |= {
-                "features": seen.features,
-                "slot_valid": seen.slot_valid,
+                "features": np.concatenate([row.features for row in rows]),
+                "slot_valid": np.concatenate([row.slot_valid for row in rows]),
                 "feature_age": np.array(np.nanmin(ages)),
                 "view_age": ages,
             }

@@ -256,6 +256,8 @@ class Session:
         due = new_prompt or observation.time_s - self._began_s >= self._between_s
         if observation.frames and due:
             self._instruction = self._instructed(observation.prompt)
+            if new_prompt:
+                self._memory.forget_features()
             self._waiting.append((observation, self._instruction))
             self._began_s = observation.time_s
         if self._waiting and self._running is None:

@@ -90,7 +90,7 @@ class Selection:
     """Where the wide fields of a batch lie in the tensors of `Gatherer.tensor`."""
 
     rows: Mapping[str, Index]
-    """`features` (batch,) and `action` (batch x horizon,)."""
+    """`features` (batch x row,) and `action` (batch x horizon,)."""
     windows: Mapping[str, Window]
     """`sensor` and `state`."""
 
@@ -158,6 +158,7 @@ class Gatherer:
         horizon: int,
         sensor_window: int,
         state_window: int,
+        feature_history: int = 1,
         but: Collection[str] = (),
     ) -> Batch:
         """Buffers for `gather(..., out=)`; fields named in `but` have a shape but no memory."""
@@ -168,10 +169,10 @@ class Gatherer:
                 return torch.empty((*shape, *like.shape[1:]), dtype=like.dtype, device="meta")
             return _buffer((*shape, *like.shape[1:]), like.dtype)
 
-        slots = self.tensor("features").shape[1]
+        features = wide("features", batch, feature_history).flatten(1, 2)
         return Batch(
-            features=wide("features", batch),
-            slot_valid=torch.empty((batch, slots), dtype=torch.bool),
+            features=features,
+            slot_valid=torch.empty(features.shape[:2], dtype=torch.bool),
             feature_age=torch.empty(batch),
             view_age=torch.empty(batch, self._arrays["vl/frame_time"].shape[1]),
             sensor=wide("sensor", batch, sensor_window),
@@ -222,10 +223,15 @@ class Gatherer:
         self, batch: Batch, tick: Index, episode: Index, lag: Late, variant: Index | None
     ) -> Index:
         row = self.vl_rows(tick, episode, lag)
-        view = row if self._variants == 1 else row * self._variants
-        view = view if variant is None else view + variant
         valid = self._arrays["vl/slot_valid"]
-        np.not_equal(valid.reshape(self._by_variant(valid))[view], 0, out=batch.slot_valid.numpy())
+        valid = valid.reshape(self._by_variant(valid))
+        history = batch.features.shape[1] // max(1, valid.shape[1])
+        first = self._arrays["episode/vl_start"][episode][:, None]
+        rows = np.maximum(row[:, None] - np.arange(max(1, history)), first)
+        view = rows if self._variants == 1 else rows * self._variants
+        view = (view if variant is None else view + variant[:, None]).ravel()
+        there = batch.slot_valid.numpy().reshape(len(view), valid.shape[1])
+        np.not_equal(valid[view], 0, out=there)
         batch.feature_age.numpy()[:] = self.feature_age(tick, row)
         now = self._arrays["tick/time"][tick][:, None]
         batch.view_age.numpy()[:] = now - self._arrays["vl/frame_time"][row]

@@ -200,6 +200,7 @@ class FeatureStore:
         variants: NDArray[np.int64] | None = None,
         sensor_window_s: float | None = None,
         state_window_s: float | None = None,
+        feature_history: int = 1,
     ) -> "Batch":
         """The batch of these ticks (store-global), in the buffers of `out` if given.
 
@@ -209,13 +210,15 @@ class FeatureStore:
         the episode's first. A lag is one number for all ticks, or (batch,). Ages are measured at
         the tick. The action chunk begins at its own tick; after the episode's end it repeats the
         last action, marked invalid. `variants` (batch,) is the variant of the VL row for each tick;
-        by default 0, the plain frames.
+        by default 0, the plain frames. `feature_history` VL rows are side by side in the slots, the
+        newest first; the episode's first stands for those before it.
 
         Raises `IndexError` for a tick that the store does not have, and `ValueError` for a variant
         that it does not have, an `out` of other sizes, or a negative lag, which would show the
         future.
         """
-        windows = (horizon, sensor_window, state_window, sensor_window_s, state_window_s)
+        reach_s = sensor_window_s, state_window_s
+        windows = (horizon, sensor_window, state_window, *reach_s, feature_history)
         lags = (feature_lag, sensor_lag_s, state_lag_s)
         batch, selection = self.select(ticks, windows, lags, out, variants)
         self.gatherer.copy(selection, batch)
@@ -224,7 +227,7 @@ class FeatureStore:
     def select(
         self,
         ticks: Sequence[int] | NDArray[np.int64],
-        windows: tuple[int, int, int, float | None, float | None],
+        windows: tuple[int, int, int, float | None, float | None, int],
         lags: "tuple[Late, Late, Late]",
         out: "Batch | None",
         variants: NDArray[np.int64] | None,
@@ -244,11 +247,12 @@ class FeatureStore:
                 f"{len(tick)} ticks, asked for {variants}. A store holds `vlm.variants` of them."
             )
         sizes = (len(tick), *windows[:3])
-        batch = self.gatherer.empty_batch(*sizes) if out is None else out
-        if batch.sizes != sizes:
+        batch = self.gatherer.empty_batch(*sizes, windows[5]) if out is None else out
+        slots = self.feature_shape[0] * windows[5]
+        if batch.sizes != sizes or batch.features.shape[1] != slots:
             raise ValueError(
-                "`out` has (batch, horizon, sensor_window, state_window) "
-                f"{batch.sizes}, asked for {sizes}"
+                "`out` has (batch, horizon, sensor_window, state_window) and slots "
+                f"{batch.sizes}, {batch.features.shape[1]}, asked for {sizes}, {slots}"
             )
         oldest_s = {"sensor": windows[3], "state": windows[4]}
         return batch, self.gatherer.select(batch, tick, *lags, variants, oldest_s)

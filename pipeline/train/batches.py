@@ -87,6 +87,8 @@ class Windows:
     state_window: int
     sensor_window_s: float | None = None
     state_window_s: float | None = None
+    feature_history: int = 1
+    """VL rows side by side in the slots, the newest first."""
 
     @classmethod
     def of(cls, params: TrainHeadParams) -> Self:
@@ -97,6 +99,7 @@ class Windows:
             params.state_readings if params.robot_state_enabled else 1,
             params.sensor_reach_s,
             params.state_reach_s,
+            params.feature_history if params.features_enabled else 1,
         )
 
 
@@ -273,7 +276,7 @@ class Prefetch(Iterator[tuple[BatchIndices, Batch]], AbstractContextManager["Pre
             buffer.copied.synchronize()
         count = len(indices.ticks)
         if buffer.batch is None or len(buffer.batch) != count:
-            lengths = self._windows[:3]
+            lengths = (*self._windows[:3], self._windows[5])
             empty = self._store.gatherer.empty_batch(count, *lengths, but=self._on_device)
             buffer.batch = empty.pin() if self._device.type == "cuda" else empty.touch()
         late = indices.lags

@@ -163,7 +163,8 @@ class ModelFeatureSource(FeatureSource):
 def head_params(params: Params) -> TrainHeadParams:
     """`train_head` with the values of `finetune` in place of its own, and nothing compiled.
 
-    Raises `ConfigError` where nothing of the model would learn, or the policy would not see it.
+    Raises `ConfigError` where nothing of the model would learn, the policy would not see it, or
+    would see more than one row.
     """
     if params.finetune.tuning.method == "none":
         raise ConfigError(
@@ -175,6 +176,11 @@ def head_params(params: Params) -> TrainHeadParams:
         raise ConfigError(
             "train_head.features_enabled is false, so the policy would not see the model that is "
             "tuned. Set it to true."
+        )
+    if params.train_head.feature_history > 1:
+        raise ConfigError(
+            f"train_head.feature_history {params.train_head.feature_history}: the model is tuned "
+            "on one row a tick. Set it to 1 for stages.finetune."
         )
     # `finetune.lr` is the model's; rows have many shapes, which torch.compile cannot take.
     kept = {"lr": params.train_head.lr, "compile": False}

@@ -100,8 +100,8 @@ class Trainer:
             fitted = partial(fit_normalization, store, split.train, replace(self.windows, **own))
             self.normalization = self.processes.shared(fitted)
             anchored = anchored_channels(store, split.train, params)
-            form = params.action_form
-            self.shape = policy_shape(store, self.normalization, anchored, form)
+            form, history = params.action_form, params.feature_history
+            self.shape = policy_shape(store, self.normalization, anchored, form, history)
             relative = partial(fit_relative, store, split.train, self.windows, self.shape)
             self.normalization = replace(
                 self.normalization, relative=self.processes.shared(relative)

@@ -286,6 +286,7 @@ def policy_shape(
     normalization: Normalization,
     anchor: Sequence[str] = (),
     action_form: Literal["recorded", "relative"] = "recorded",
+    history: int = 1,
 ) -> PolicyShape:
     """The widths of this store's streams, and which action channels are anchored.
 
@@ -305,6 +306,7 @@ def policy_shape(
         anchors=find_anchors(action, known_state, anchor),
         relative=find_relative(action, known_state) if action_form == "relative" else (),
         places=slot_places(store.attrs["slots"][: store.feature_shape[0]]),
+        history=history,
     )
 
 

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -186,3 +188,22 @@ def test_readers_need_to_know_the_places():
     params = TrainHeadParams.model_validate({"feature_encoder": {"kind": "pooler"}})
     with pytest.raises(ConfigError, match=r"feature_encoder\.kind pooler: .*Train from a store"):
         build_encoders(params, unknown)
+
+
+@pytest.mark.parametrize("kind", ["linear", "mean", "pooler"])
+def test_a_history_of_rows_is_read_row_by_row(kind):
+    documents = slots(side=2)
+    shape = replace(shape_of(documents), history=2)
+    params = TrainHeadParams.model_validate(
+        {"feature_encoder": {"kind": kind, "queries": 3, "dim": 8, "heads": 2}}
+    )
+    encoder = build_encoders(params, shape)[0]["features"]
+    features, valid = seen(1, 2 * len(documents))
+    age = torch.zeros(1)
+    tokens = encoder(features, valid, age)
+    swapped = features.view(1, 2, len(documents), 16).flip(1).flatten(1, 2)
+    assert not torch.allclose(tokens, encoder(swapped, valid, age))  # it knows which is newer
+    valid[:, len(documents) :] = False
+    changed = features.clone()
+    changed[:, len(documents) :] = torch.nan
+    assert torch.equal(encoder(features, valid, age), encoder(changed, valid, age))

@@ -212,6 +212,11 @@ class TestVariants:
         if asked is not None:
             asked = asked.astype(np.int64)
         batch = varied.gather(ticks, feature_lag=lag, variants=asked)
+        both = varied.gather(ticks, feature_lag=lag, variants=asked, feature_history=2)
+        older = varied.gather(ticks, feature_lag=lag + 1, variants=asked)
+        assert torch.equal(both.features, torch.cat([batch.features, older.features], dim=1))
+        assert torch.equal(both.slot_valid, torch.cat([batch.slot_valid, older.slot_valid], dim=1))
+        assert torch.equal(both.feature_age, batch.feature_age)
         assert varied.feature_shape == batch.features.shape[1:] == (2, 8)
         stored = varied.array("vl/features")
         if stored.dtype == np.uint16:

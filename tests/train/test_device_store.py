@@ -29,7 +29,7 @@ def test_batches_are_those_of_the_map(any_store, draw_plan, same_bits):
     for fields in FIELDS:
         resident = DeviceStore(any_store, fields, CPU)
         for window, late in ((1, Lags()), (40, Lags()), (40, Lags(2, 0.13, 0.2))):
-            windows = Windows(4, window, window + 1)
+            windows = Windows(4, window, window + 1, feature_history=1 + window // 20)
             asked = [replace(indices, lags=late) for indices in wanted]
             with (
                 Prefetch(any_store, asked, windows, CPU) as mapped,

@@ -216,6 +216,9 @@ class TrainHeadParams(Section):
     feature_lag: int = Field(default=0, ge=0, le=1000)
     """Most VL rows that features are late in training, drawn uniformly for each sample, so that a
     policy learns to work with a slow model."""
+    feature_history: int = Field(default=1, ge=1, le=64)
+    """VL rows that the policy sees, the newest and those before it in the episode; the first one
+    stands for those before it."""
     anchor: Literal["auto"] | tuple[str, ...] = "auto"
     """Action channels that count from the arm's position at the time of the newest frame, such as
     `[dx, dy]`, so that what vision shows stays true when the model is late. They must be deltas
