@@ -125,10 +125,10 @@ class FeaturePooler(nn.Module):
     """Learned queries that attend to the slots: features (batch, slot, dim) -> (batch, query, dim).
 
     The slots of a place in all layers of a row become one key, by a learned mixture of the layers.
-    A key knows its row and where in which view it looks, by Fourier features of its cell's centre (Tancik et al.
-    2020) and embeddings of view and pooling, so that parameters do not grow with the number of
-    slots. Keys without a valid slot are masked. The state moves the queries through a gate that is
-    0 at first: it directs where they look, but the values are of the slots alone.
+    A key knows its row and where in which view it looks, by Fourier features of its cell's centre
+    (Tancik et al. 2020) and embeddings of view and pooling, so that parameters do not grow with the
+    number of slots. Keys without a valid slot are masked. The state moves the queries through a
+    gate that is 0 at first: it directs where they look, but the values are of the slots alone.
     """
 
     index: Int[Tensor, "place 2"]
