@@ -33,6 +33,11 @@ class StageOne:
         self._build.close()
         self._build = self._workload.fresh_build()
 
+    @property
+    def row_bytes(self) -> int:
+        """Bytes of a row's features."""
+        return self._build.specs["vl/features"].row_bytes
+
     def run_every_frame(self) -> None:
         """Fill the store, computing anew what is shown again: no row or frame is spared."""
         with ExitStack() as stack:

@@ -41,7 +41,11 @@ def unpack(values: Stored) -> Float[Tensor, "*batch dim"]:
         return values
     scale, codes = scales(values).float(), values[..., : _dim(values)]
     if values.dtype == torch.uint8:
-        return codes.view(_FLOAT8).float() * scale
+        # Sign, exponent and mantissa where a float32 has them, 2**120 too small: on a CPU several
+        # times as fast as the conversion.
+        bits = codes.to(torch.int32)
+        bits = ((bits & 0x80) << 24) | ((bits & 0x7F) << 20)
+        return bits.view(torch.float32).mul_(2.0**120).mul_(scale)
     short = -codes.shape[-1] % BLOCK
     blocks = F.pad(codes, (0, short)).unflatten(-1, (-1, BLOCK)) * scale.unsqueeze(-1)
     return blocks.flatten(-2)[..., : codes.shape[-1]]

@@ -1,0 +1,97 @@
+"""What slots and storage dtypes cost: stage one's speed against the mean alone, and bytes a row.
+
+    python -m benchmarks.slots [--rows N] [--quick]
+
+Every contender fills a store of its own with the same recordings, the model loaded beforehand; all
+frames differ. Beside them, what it costs to make numbers of int8 and float8 again, against the copy
+of as many numbers in float32. Prints one JSON line.
+"""
+
+import tempfile
+from contextlib import ExitStack, closing
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from benchmarks.stage_one import StageOne
+from benchmarks.timing import arguments, at_least, race, report
+from benchmarks.workload import Workload, params_of, write_recordings
+from pipeline.base.digests import ContentDigests
+from pipeline.base.packing import pack, unpack
+from pipeline.vlm.demo_checkpoint import write_demo_checkpoint
+from pipeline.vlm.qwen import FrozenVLM
+
+GRID: dict[str, Any] = {"pooling": ["mean", "grid"]}
+TOKENS: dict[str, Any] = {"pooling": ["tokens"]}
+CONTENDERS: dict[str, tuple[dict[str, Any], str]] = {
+    "mean": ({"pooling": ["mean"]}, "float32"),
+    "mean, grid": (GRID, "float32"),
+    "tokens": (TOKENS, "float32"),
+    "tokens, float16": (TOKENS, "float16"),
+    "tokens, float8": (TOKENS, "float8"),
+    "tokens, int8": (TOKENS, "int8"),
+    "tokens of four layers": (TOKENS | {"layers": [0, 1, 2, 3]}, "float32"),
+    "tokens of the vision tower": (TOKENS | {"layers": ["vision"]}, "float32"),
+}
+_DIM, _SLOTS = 2048, 48
+
+
+def main() -> None:
+    """Race, and print the line."""
+    parser = arguments(__doc__ or "")
+    parser.add_argument("--rows", type=int, default=150, help="VL rows that a store has")
+    wanted = parser.parse_args()
+    rows, rounds = (20, 1) if wanted.quick else (wanted.rows, wanted.rounds or 5)
+    with tempfile.TemporaryDirectory() as place, ExitStack() as stack:
+        folder = Path(place)
+        write_recordings(folder, rows)
+        write_demo_checkpoint(folder / "vlm")
+        runs = {name: _stage_one(folder, name, rows, stack) for name in CONTENDERS}
+        raced = race(
+            {name: run.run_every_frame for name, run in runs.items()},
+            rounds=rounds,
+            before={name: run.prepare for name, run in runs.items()},
+        )
+        ratios = raced.ratios("mean")
+        row_bytes = {name: run.row_bytes for name, run in runs.items()}
+    numbers = torch.randn(64, _SLOTS, _DIM)
+    copied = torch.empty_like(numbers)
+    held = {dtype: pack(numbers, dtype) for dtype in ("int8", "float8")}
+    decoding = race(
+        {"copy in float32": lambda: copied.copy_(numbers)}
+        | {dtype: lambda dtype=dtype: unpack(held[dtype]) for dtype in held},
+        rounds=rounds,
+        least_s=0.2,
+    )
+    report(
+        "slots",
+        settings={"rows": rows, "rounds": rounds, "decoded": [64, _SLOTS, _DIM]},
+        results={
+            "extraction": raced.results({"rows": rows}),
+            "row_bytes": row_bytes,
+            "decoding": decoding.results({"GB_of_float32": numbers.nbytes / 1e9}),
+        },
+        ratios={"extraction": ratios, "decoding": decoding.ratios("copy in float32")},
+        targets=[
+            at_least(f"extraction of {name} against the mean alone", ratios[name], 0.9)
+            for name in ("mean, grid", "tokens", "tokens, int8")
+        ],
+        quick=wanted.quick,
+    )
+
+
+def _stage_one(folder: Path, name: str, rows: int, stack: ExitStack) -> StageOne:
+    """Stage one with a contender's slots and dtype, in a folder of its own."""
+    vlm, dtype = CONTENDERS[name]
+    params = params_of(folder, "cpu", vlm | {"dtype": "float32"})
+    store = folder / f"{name.replace(' ', '-').replace(',', '')}.zarr"
+    extract = params.extract.model_copy(update={"store": store, "dtype": dtype})
+    params = params.model_copy(update={"extract": extract})
+    digests = stack.enter_context(closing(ContentDigests(folder / "digests.sqlite")))
+    work = Workload.of(params, rows, digests)
+    return StageOne(work, FrozenVLM.load(params.vlm, work.survey.spec, "cpu"), 8)
+
+
+if __name__ == "__main__":
+    main()
