@@ -1,5 +1,7 @@
 """The harness vla-eval, as it is, asks a policy of ours and gets what the policy answers here."""
 
+import gc
+import runpy
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, ClassVar
@@ -11,6 +13,7 @@ import pytest
 from pipeline.base.config import load_params
 from pipeline.base.errors import ConfigError
 from pipeline.robot.loop import Executor
+from pipeline.robot.session import ServedPolicy
 from pipeline.simulation.insertion import INSTRUCTION
 from pipeline.simulation.rendering import VIEWS
 
@@ -21,7 +24,8 @@ from vla_eval.connection import Connection  # noqa: E402
 
 from experiments.vla_eval_server import PolicyModelServer  # noqa: E402
 
-PARAMS = Path(__file__).parents[2] / "params.yaml"
+ROOT = Path(__file__).parents[2]
+PARAMS, SERVER = ROOT / "params.yaml", ROOT / "experiments" / "vla_eval_server.py"
 CAMERAS = dict(zip(VIEWS, ("agentview", "wrist", "side", "top", "back"), strict=False))
 NAMES = {f"images/{view}": f"images/{camera}" for view, camera in CAMERAS.items()}
 NAMES |= {"state": "states"}
@@ -107,6 +111,7 @@ def test_its_client_gets_what_a_session_here_answers_bit_for_bit(
     np.testing.assert_array_equal(passes[-1]["View1"], seen(1, 6)["images"]["agentview"])
     np.testing.assert_array_equal(played, [answered_here(made, episode) for episode in range(2)])
     assert not np.array_equal(*played)
+    gc.collect()
     assert not made.server._episodes  # What has ended is forgotten.
 
 
@@ -171,3 +176,26 @@ def test_what_does_not_fit_is_refused_by_name_and_the_next_episode_runs(
     for override, why in (("execute=5", "expected 1 to 4"), ("chunking=rtc", "found rtc")):
         with pytest.raises(ConfigError, match=why):
             serving_to_vla_eval("regression", f"rollout.{override}")
+
+
+def test_the_command_serves_on_this_machine_only(served_policy, monkeypatch, capsys) -> None:
+    served, begun = served_policy("regression"), []
+    monkeypatch.setattr(ServedPolicy, "load", lambda folder, *_: begun.append(folder) or served)
+    monkeypatch.setattr("vla_eval.model_servers.serve.serve", lambda *own: begun.extend(own))
+    names = ("images/View1=images/a=b", "sensor=touch")
+    options = ("--params", str(PARAMS), "--set", "serve.port=8123", "--set", "serve.checkpoint=h")
+
+    def run(*arguments: str) -> Any:
+        monkeypatch.setattr("sys.argv", ["vla_eval_server", *arguments])
+        with pytest.raises(SystemExit) as end:
+            runpy.run_path(str(SERVER), run_name="__main__")
+        return end.value.code
+
+    assert run(*names, *options) == 0
+    folder, server, host, port = begun
+    assert (str(folder), host, port) == ("h", "127.0.0.1", 8123)
+    other = {"images/View1": "images/a=b", "sensor": "touch", "prompt": "task_description"}
+    assert server._names == {name: name for name in server._names} | other
+    assert {*server._names} == {*NAMES, "sensor", "prompt"}
+    assert run("states", *options) == 2
+    assert "error: states: expected some of images/View1" in capsys.readouterr().err
