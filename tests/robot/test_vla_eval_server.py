@@ -69,9 +69,11 @@ def answered_here(made: Any, episode: int) -> list[np.ndarray]:
         given = seen(episode, tick)
         own = {f"images/{view}": given["images"][camera] for view, camera in CAMERAS.items()}
         own |= {"state": given["states"], "time": tick / HZ, "prompt": INSTRUCTION}
+        asked = tick % rollout.execute == 0
+        if asked and (plan := executor.begin()) is not None:
+            own |= {"guide/chunk": plan.chunk, "guide/weight": plan.weight}
         observation = session.take(own)
-        if tick % rollout.execute == 0:
-            executor.begin()
+        if asked:
             executor.plan(session.answer(observation)["actions"])
         actions.append(executor.next_action())
     return actions
@@ -95,7 +97,7 @@ def ask(url: str, episodes: int, **changed: Any) -> list[list[np.ndarray]]:
 
 @pytest.mark.parametrize(
     ("model_type", "execute", "chunking"),
-    [("regression", 1, "temporal"), ("flow_matching", 3, "none")],
+    [("regression", 1, "temporal"), ("flow_matching", 3, "none"), ("diffusion", 1, "rtc")],
 )
 def test_its_client_gets_what_a_session_here_answers_bit_for_bit(
     serving_to_vla_eval, model_type: str, execute: int, chunking: str
@@ -106,7 +108,7 @@ def test_its_client_gets_what_a_session_here_answers_bit_for_bit(
     with api.serve_background(made.server) as running:
         played = ask(running.url, 2)
     passes = [frames[0] for frames in made.served.glance.passes]
-    # A pass of the model every third tick, at which the head is asked in both cases.
+    # A pass of the model every third tick, at which the head is asked in all cases.
     assert len(passes) == 2 * len(range(0, TICKS, REUSE))
     np.testing.assert_array_equal(passes[-1]["View1"], seen(1, 6)["images"]["agentview"])
     np.testing.assert_array_equal(played, [answered_here(made, episode) for episode in range(2)])
@@ -158,7 +160,7 @@ def test_its_harness_runs_a_benchmark_to_the_end(serving_to_vla_eval, monkeypatc
 
 
 def test_what_does_not_fit_is_refused_by_name_and_the_next_episode_runs(
-    serving_to_vla_eval,
+    serving_to_vla_eval, caplog
 ) -> None:
     made = serving_to_vla_eval("regression")
     with api.serve_background(made.server) as running:
@@ -170,6 +172,9 @@ def test_what_does_not_fit_is_refused_by_name_and_the_next_episode_runs(
             with pytest.raises(RuntimeError, match=f"observation_failed: ObservationError: {why}"):
                 ask(running.url, 1, **changed)
         assert len(ask(running.url, 1)[0]) == TICKS
+        assert "never trained on" not in caplog.text
+        ask(running.url, 1, task_description="go")
+        assert "prompt: the policy was never trained on 'go'" in caplog.text
     for wrong in ("state:states", "images/Vew1", "sensor"):
         with pytest.raises(ConfigError, match=f"{wrong}: expected some of images/View1, .*prompt"):
             PolicyModelServer(made.served, made.params, {wrong: "x"})
