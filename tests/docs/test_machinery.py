@@ -57,7 +57,7 @@ class TestParamsPage:
 
     def test_says_type_range_default_and_meaning(self, page):
         (entry,) = re.findall(r"^`vlm\.layers`.*\n:   .*$", page, re.MULTILINE)
-        assert "list of (whole number), at least 1; default `[-1]`" in entry
+        assert "list of (whole number or `vision`), at least 1; default `[-1]`" in entry
         assert "Decoder layers whose output is taken" in entry
         assert "`train_head.drop_state`{ #train_head.drop_state } number, from 0 to 1;" in page
         assert "`data.sources[].name`{ #data.sources.name } text, not empty; **has to" in page
