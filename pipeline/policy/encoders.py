@@ -24,6 +24,11 @@ from pipeline.policy.attention import (
 )
 from pipeline.policy.shape import PolicyShape
 
+_KIND_STD = 0.3
+"""Initial std of what all keys of a view or pooling share: at 1 it drowned what a slot shows."""
+_SHARPNESS = 4.0
+"""Initial scale of what a query asks: at 1 it attends to all slots alike, and learns more slowly
+to look at one."""
 _OCTAVES = 5
 """Wavelengths of a place: from twice the view's side to an eighth of it."""
 _FORCE_SHARE = 4
@@ -102,6 +107,7 @@ class SlotAttention(nn.Module):
         super().__init__()
         self.norm = nn.LayerNorm(dim)
         self.attention = Attention(dim, heads)
+        nn.init.normal_(self.attention.query.weight, std=_SHARPNESS * (3 * dim) ** -0.5)
         self.feed_forward = nn.Sequential(
             nn.LayerNorm(dim),
             nn.Linear(dim, 4 * dim),
@@ -138,14 +144,16 @@ class FeaturePooler(nn.Module):
         super().__init__()
         places, dim = shape.places, params.dim
         self.rows_and_layers = shape.history, shape.layers
-        self.row = nn.Embedding(shape.history, dim)
         self.mixture = nn.Parameter(torch.zeros(shape.layers))
         self.squeeze = nn.Linear(shape.feature_dim, dim)
         kinds = [
             sorted({place.pooling for place in places}),
             sorted({p.view or "" for p in places}),
         ]
+        self.row = nn.Embedding(shape.history, dim)
         self.kinds = nn.ModuleList(nn.Embedding(len(names), dim) for names in kinds)
+        for embedding in (self.row, *self.kinds):
+            nn.init.normal_(embedding.weight, std=_KIND_STD)
         index = [[kinds[0].index(p.pooling), kinds[1].index(p.view or "")] for p in places]
         centers = torch.tensor([p.center or (0.5, 0.5) for p in places])
         waves = centers[..., None] * torch.pi * 2 ** torch.arange(_OCTAVES)

@@ -85,5 +85,5 @@ def test_every_snippet_is_at_least_python():
 
 def test_the_store_page_has_a_snippet_of_each_library():
     code = "\n".join(one.code for one in snippets(ROOT / "docs" / "store.md"))
-    for library in ("FeatureStore", "numpy", "zarr", "xarray", "dask", "tensorstore"):
+    for library in ("FeatureStore", "numpy", "zarr", "xarray", "dask"):
         assert re.search(rf"import {library}\b", code), library
