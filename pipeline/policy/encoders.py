@@ -150,10 +150,11 @@ class FeaturePooler(nn.Module):
             sorted({place.pooling for place in places}),
             sorted({p.view or "" for p in places}),
         ]
-        self.row = nn.Embedding(shape.history, dim)
-        self.kinds = nn.ModuleList(nn.Embedding(len(names), dim) for names in kinds)
-        for embedding in (self.row, *self.kinds):
+        sizes = (shape.history, *map(len, kinds))
+        self.row, *of_kinds = (nn.Embedding(size, dim) for size in sizes)
+        for embedding in (self.row, *of_kinds):
             nn.init.normal_(embedding.weight, std=_KIND_STD)
+        self.kinds = nn.ModuleList(of_kinds)
         index = [[kinds[0].index(p.pooling), kinds[1].index(p.view or "")] for p in places]
         centers = torch.tensor([p.center or (0.5, 0.5) for p in places])
         waves = centers[..., None] * torch.pi * 2 ** torch.arange(_OCTAVES)
