@@ -194,7 +194,7 @@ class FeaturePooler(nn.Module):
         steer = 0.0
         if self.steer is not None and state is not None:
             steer = self.gate * self.steer(state)
-        tokens = self.queries.expand(len(features), -1, -1)
+        tokens = self.queries.expand(features.shape[0], -1, -1)  # len() would fix it in an export
         for read in self.reads:
             # A row without any slot attends to what it lacks: softmax over nothing is NaN.
             tokens = read(tokens, keys, present | missing, steer)

@@ -23,7 +23,7 @@ from pipeline.policy.checkpoint import PolicyCheckpoint
 from pipeline.policy.normalization import ChannelStatistics, Normalization
 from pipeline.policy.observation import PolicyShape
 from pipeline.policy.policy import Policy
-from pipeline.policy.shape import Anchor
+from pipeline.policy.shape import Anchor, SlotPlace
 from pipeline.robot import export
 from pipeline.robot.export import (
     ExportedHead,
@@ -67,6 +67,8 @@ FEATURES_ALONE: dict[str, Any] = {
     "robot_state_enabled": False,
     "model_type": "diffusion",
     "diffusion": {"timesteps": 6, "sampling_steps": 2, "eta": 1.0},
+    "feature_encoder": {"kind": "pooler", "queries": 2, "dim": 4, "heads": 1},
+    "feature_history": 2,
 }
 RARE: list[dict[str, Any]] = [
     {
@@ -95,9 +97,11 @@ RARE: list[dict[str, Any]] = [
 def checkpoint_of(**changed: Any) -> PolicyCheckpoint:
     """Of a policy whose every weight is heard; that of `FLOW` counts from states."""
     params = TrainHeadParams.model_validate(SMALL | changed)
-    shape = SHAPE
+    views = [SlotPlace("tokens", view, (0.5, 0.5)) for view in STREAMS["views"]]
+    places = (SlotPlace("mean"), *views)
+    shape = replace(SHAPE, places=places, history=params.feature_history)
     if changed == FLOW:
-        shape = replace(SHAPE, anchors=(Anchor((0,), (0,)),), relative=(Anchor((1,), (1,)),))
+        shape = replace(shape, anchors=(Anchor((0,), (0,)),), relative=(Anchor((1,), (1,)),))
     rng = np.random.default_rng(0)
     fitted = {
         name: ChannelStatistics(rng.normal(size=size), rng.uniform(0.5, 2.0, size), 100)
