@@ -9,9 +9,9 @@ Each recipe is trained with each of `seeds` seeds, judged on the test episodes, 
 already in FOLDER is not done again, so a command that was stopped goes on, and tables share
 policies; rollouts of another number of episodes are done again.
 
-`worth` and `staleness` run nothing. They draw what is in FOLDER: success against errors on
-recordings, a point a policy; and success against what a pass of the model takes (tables `latency`,
-`before` and `many`).
+`worth`, `staleness` and `size` run nothing. They draw what is in FOLDER: success against errors on
+recordings, a point a policy; success against what a pass of the model takes (tables `latency`,
+`before` and `many`); and success against the bytes of a VL row (tables `slots` and `bytes`).
 
 The last line is JSON: of each row success with Wilson's interval over the rollouts of all seeds,
 and the errors in training std over all seeds and their differences from the table's first row
@@ -54,6 +54,7 @@ from experiments.recipes import (
 from pipeline.base.config import load_params
 from pipeline.evaluate.figures import bootstrap_means
 from pipeline.evaluate.rollouts import EXPERT, POLICY, SuccessRate
+from pipeline.store import FeatureStore
 
 FIGURES = ("executed", "overall")
 _AS_IT_IS = (
@@ -71,7 +72,7 @@ FIRST_SEED = 3_000_000
 def main() -> None:
     """Run what is not done, and print the table."""
     parser = ArgumentParser("experiments.closed_loop", description=(__doc__ or "").split("\n")[0])
-    parser.add_argument("table", choices=[*TABLES, "worth", "staleness"])
+    parser.add_argument("table", choices=[*TABLES, "worth", "staleness", "size"])
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--seeds", type=int, default=2)
     parser.add_argument("--episodes", type=int, default=100)
@@ -85,6 +86,8 @@ def main() -> None:
         _draw_worth(wanted.out)
     elif wanted.table == "staleness":
         _draw_staleness(wanted)
+    elif wanted.table == "size":
+        _draw_size(wanted)
     else:
         _refuse_other_params(wanted.out)
         _make_table(wanted, TABLES[wanted.table])
@@ -350,6 +353,43 @@ def _draw_staleness(wanted: Namespace) -> None:
     (picture,) = style.write(wanted.out, {"staleness.png": draw})
     print(picture)
     print(json.dumps({"table": "staleness", "by_latency_ms": curves}))
+
+
+def _draw_size(wanted: Namespace) -> None:
+    """Success with its interval against the bytes of a row, a point for what is kept and read."""
+    from pipeline.look.page import style
+
+    points: dict[str, dict[str, Any]] = {}
+    for name in dict.fromkeys((*TABLES["slots"].recipes, *TABLES["bytes"].recipes)):
+        folders = [_folder(wanted.out, name, seed) for seed in range(wanted.seeds)]
+        if episodes := _episodes([folder / ON_TIME for folder in folders]).get(POLICY):
+            told = store_settings(RECIPES[name], wanted.out)
+            store = FeatureStore.open(load_params(Path("params.yaml"), told).extract.store)
+            row_bytes = store.array("vl/features")[:1].nbytes
+            points[name] = {"row_bytes": row_bytes, "success": _success(episodes)}
+    if not points:
+        raise SystemExit(f"{wanted.out}: nothing to draw. Make the table `slots` there first.")
+
+    def draw() -> Any:
+        figure, panels = style.panels(8.5, 5.2, 1, 1)
+        for index, (name, point) in enumerate(points.items()):
+            rate, low, high = (100 * number for number in point["success"])
+            learned = "pooler" in name
+            panels.errorbar(
+                point["row_bytes"],
+                rate,
+                [[rate - low], [high - rate]],
+                fmt="s" if learned else "o",
+                color=style.PALETTE[index % len(style.PALETTE)],
+                label=name,
+            )
+        panels.set(xscale="log", xlabel="bytes of a VL row's features", ylabel="inserted [%]")
+        panels.legend(fontsize="small", loc="lower right")
+        return figure
+
+    (picture,) = style.write(wanted.out, {"success_bytes.png": draw})
+    print(picture)
+    print(json.dumps({"table": "size", "points": points}))
 
 
 if __name__ == "__main__":
