@@ -49,6 +49,8 @@ class ProbeResult:
     alone: ProbeScore
     beside: ProbeScore
     """The score with all inputs that are known without features; results are ranked by it."""
+    row_bytes: int = 0
+    """Bytes of its slots in a row of the store."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -181,6 +183,7 @@ def probe(store: FeatureStore, params: ProbeParams) -> ProbeStudy:
             valid_share=float(valid[of_tick].mean()),
             alone=score(inputs),
             beside=score(inputs, beside=True),
+            row_bytes=store.array("vl/features")[:1, list(own)].nbytes,
         )
 
     # Each slot and its linear algebra stay on one thread: the same bits for any number of threads.

@@ -19,7 +19,7 @@ def write_tables(folder: Path, study: ProbeStudy) -> list[Path]:
 
     targets.csv has R^2 by channel and step of the chunk, for the baseline and for each group.
     """
-    of_groups = ("slots", "channels", "inputs")
+    of_groups = ("slots", "channels", "inputs", "row_bytes")
     slots = [_row(study, result) for result in ranked(study.slots)]
     tables = {
         "slots.csv": [{k: v for k, v in row.items() if k not in of_groups} for row in slots],
@@ -72,16 +72,19 @@ def ranking(study: ProbeStudy) -> Table:
     baselines = [("mean action", 0, study.mean_action)]
     baselines += [(known.name, known.inputs, known.score) for known in study.known]
     rows: list[list[Any]] = [
-        [name, inputs, None, score.r2.text("+"), None, None] for name, inputs, score in baselines
+        [name, inputs, None, None, score.r2.text("+"), None, None]
+        for name, inputs, score in baselines
     ]
     single = [result for result in ranked(study.slots) if result.name != result.name.group]
     for result in [*ranked(study.groups), *single[:TOP]]:
         several = f" ({len(result.slots)} slots)" if len(result.slots) > 1 else ""
-        rows.append([result.name.label + several, result.inputs, f"{result.valid_share:.0%}"])
+        size = f"{result.row_bytes:,}"
+        rows.append([result.name.label + several, result.inputs, f"{result.valid_share:.0%}", size])
         figures = (result.alone.r2, result.beside.r2, study.gain(result))
         rows[-1] += [figure.text("+") for figure in figures]
-    heads = ["what is read", "gain", "R2 beside", "R2 alone", "inputs", "valid"]
-    return Table(heads, [[row[0], row[5], row[4], row[3], row[1], row[2]] for row in rows])
+    heads = ["what is read", "gain", "R2 beside", "R2 alone", "inputs", "valid", "bytes a row"]
+    order = (0, 6, 5, 4, 1, 2, 3)
+    return Table(heads, [[row[place] for place in order] for row in rows])
 
 
 def codec_table(study: ProbeStudy) -> Table:
@@ -166,6 +169,7 @@ def _row(study: ProbeStudy, result: ProbeResult) -> dict[str, Any]:
         "slots": len(result.slots),
         "channels": result.channels,
         "inputs": result.inputs,
+        "row_bytes": result.row_bytes,
         "valid_share": result.valid_share,
     }
     scores = {"alone": result.alone, "beside": result.beside}
