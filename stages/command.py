@@ -38,6 +38,8 @@ class Shorthand:
     """As in argparse: `"*"` takes a list; with `"?"` the value may be left out and is then true."""
     repeated: bool = False
     """Whether commands that a message advises to run next need it, too."""
+    alone: bool = False
+    """Whether the command needs no params.yaml where this is given."""
 
     def add_to(self, parser: argparse.ArgumentParser) -> None:
         """Add it to the parser."""
@@ -124,7 +126,7 @@ def _run(
     sections: Sequence[str],
 ) -> int:
     """Do what `run` does after it has parsed the options."""
-    from pipeline.base.commands import running_with
+    from pipeline.base.commands import DEFAULT_PARAMS, running_with
     from pipeline.base.config import Params, described_keys, load_params
     from pipeline.base.errors import PipelineError
 
@@ -133,7 +135,11 @@ def _run(
             print("\n".join(described_keys(sections or tuple(Params.model_fields))))
         else:
             given = [pair for shorthand in shorthands for pair in shorthand.override(options)]
-            params = load_params(options.params, [*options.overrides, *given])
+            alone = any(one.alone and one.override(options) for one in shorthands)
+            absent = alone and options.params == DEFAULT_PARAMS and not DEFAULT_PARAMS.exists()
+            if absent:
+                print(f"no {DEFAULT_PARAMS} in this folder: every key has its default")
+            params = load_params(None if absent else options.params, [*options.overrides, *given])
             again = (shorthand for shorthand in shorthands if shorthand.repeated)
             repeated = [pair for shorthand in again for pair in shorthand.override(options)]
             with running_with(options.params, [*options.overrides, *repeated]):

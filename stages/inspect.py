@@ -32,7 +32,12 @@ SHORTHANDS = (
     *short("data", "--views"),
     *short("inspect", "--out"),
     Shorthand(
-        "path", "inspect.path", "recordings, folders or globs of them, or a store", "PATH", "*"
+        "path",
+        "inspect.path",
+        "recordings, folders or globs of them, or a store",
+        "PATH",
+        "*",
+        alone=True,
     ),
     Shorthand("--rerun", "inspect.rerun", "write Rerun files, to scrub through, and no page"),
 )

@@ -28,7 +28,10 @@ def make_named(key: str, name: str, arguments: Mapping[str, Any] | None = None) 
         ) from error
     made_by = getattr(home, made, None)
     if made_by is None:
-        raise ConfigError(f"{key}: {name}: expected {made} in {home.__file__}, found none")
+        raise ConfigError(
+            f"{key}: {name}: expected {made} in {home.__file__}, found none. Name a class or "
+            "function that this module has"
+        )
     try:
         bound = inspect.signature(made_by).bind(**arguments or {})
     except TypeError as error:

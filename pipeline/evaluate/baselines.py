@@ -15,6 +15,7 @@ from sklearn.preprocessing import StandardScaler
 from sklearn.random_projection import SparseRandomProjection
 
 from pipeline.base.arrays import widen
+from pipeline.base.channels import hardly_moving
 from pipeline.policy.normalization import ChannelStatistics
 from pipeline.policy.robot_state import expand
 from pipeline.policy.shape import Kind, channel_kinds
@@ -46,7 +47,11 @@ class Baselines:
         self, store: FeatureStore, ticks: Ticks, horizon: int, features: ChannelStatistics | None
     ) -> None:
         self._store, self._horizon = store, horizon
-        self._median = np.median(store.array("tick/action")[ticks], axis=0)
+        action, units = store.array("tick/action")[ticks], store.streams["action"]["units"]
+        self._median = np.median(action, axis=0)
+        spread = action.std(axis=0, dtype=np.float64)
+        still = list(hardly_moving(spread, [""] * len(spread), units))
+        self._moving = np.setdiff1d(np.arange(len(spread)), still)
         fitted = evenly(ticks, _FITTED)
         chunks, valid = recorded_chunks(store, fitted, horizon)
         past = self._past(fitted)
@@ -62,11 +67,12 @@ class Baselines:
         """The actions of each of `BASELINES` at these ticks: (tick, horizon or 1, action_dim).
 
         `zero_action`: no motion. `median_action`: the median of the training ticks. `repeat_last`:
-        the action of the previous tick. `linear_fit`: a linear function of all dimensions of the
-        two previous actions, by least squares for each step of the chunk. Before an episode's first
-        tick, actions count as zero if they are deltas or velocities, and as the median if they are
-        absolute: zero would be a pose far from all others. `nearest_neighbour`: the chunk of the
-        training tick whose newest state reading and features are most alike.
+        the action of the previous tick. `linear_fit`: a linear function of the two previous actions
+        (of all dimensions but those that hardly move), by least squares for each step of the chunk.
+        Before an episode's first tick, actions count as zero if they are deltas or velocities, and
+        as the median if they are absolute: zero would be a pose far from all others.
+        `nearest_neighbour`: the chunk of the training tick whose newest state reading and features
+        are most alike.
         """
         zero = np.zeros((len(ticks), 1, len(self._median)), np.float32)
         nearest = self._neighbours.nearest(ticks)
@@ -83,8 +89,11 @@ class Baselines:
         }
 
     def _past(self, ticks: Ticks) -> Values:
-        """The two previous actions, and a constant."""
-        two = [self._before(ticks, back) for back in (1, 2)]
+        """The two previous actions, and a constant.
+
+        A joint that hardly moves in training is left out: the fit would make much of its noise.
+        """
+        two = [self._before(ticks, back)[:, self._moving] for back in (1, 2)]
         return np.concatenate([*two, np.ones((len(ticks), 1))], axis=1)
 
     def _before(self, ticks: Ticks, back: int) -> Values:

@@ -173,7 +173,8 @@ def _refuse_other_robot(
         raise CheckpointMismatch(
             f"rollout.environment: the policy was trained on another robot than {robot.name}: "
             f"{_described(views, kind, widths, hz)}, of {robot.name} "
-            f"{_described(robot.views, robot.action_kind, own, robot.hz)}. Judge it on its own "
+            f"{_described(robot.views, robot.action_kind, own, robot.hz)}. Name the environment of "
+            "its robot, such as metaworld:TASK (docs/rollout.md), or judge it on its own "
             f"recordings ({command('evaluate')}) and set rollout.environment to null, which leaves "
             "rollouts out of dvc repro."
         )

@@ -187,7 +187,7 @@ def still_dimensions(comparison: Comparison) -> str:
 def verdicts(comparison: Comparison) -> str:
     """Whether policy and best baseline differ overall, in each scope."""
     if not _has_intervals(comparison):
-        return NO_INTERVAL
+        return f"{NO_INTERVAL}: five folds test each recording once (docs/training.md)"
     words: list[str] = []
     for scope, part in scopes(comparison).items():
         rivals = rivalry(part)

@@ -150,12 +150,14 @@ def _executor(surveyed: Survey) -> Executor:
 
 
 def _survey_lines(surveyed: Survey) -> Iterator[str]:
+    root = surveyed.data.root.absolute()
     for source in surveyed.data.sources:
         if source.hub is not None:
             yield f"source {source.name!r}: {source.hub} is on the Hub, so DVC does not watch it"
         for path in source.paths:
-            if Path(path).is_absolute():
-                yield f"source {source.name!r}: {path} is absolute, so DVC does not watch it"
+            if Path(path).is_absolute() and not Path(path).is_relative_to(root):
+                outside = f"{path} is outside data.root ({surveyed.data.root})"
+                yield f"source {source.name!r}: {outside}, so DVC does not watch it"
     missing = [f"not there: {line}" for line in surveyed.missing]
     yield from capped(missing, "episodes that are not there", MOST_EPISODES)
     depth = {(r.source, view) for r in surveyed.recordings for view in r.depth_views()}

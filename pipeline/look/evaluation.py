@@ -151,7 +151,10 @@ def _advice(evaluation: Evaluation, rollout: str) -> Iterator[str]:
             "docs/worse.md: it says which switch first."
         )
     if groups < _FEW:
-        yield f"Hold out more: {groups} group(s) of test recordings leave wide intervals."
+        yield (
+            f"Hold out more: {groups} group(s) of test recordings leave wide intervals, or none. "
+            "Five folds test each recording once (docs/training.md)."
+        )
     if rollout:
         yield "See the rollouts: whether the task succeeds, errors cannot tell."
     elif rivals.verdict == "better":

@@ -283,7 +283,8 @@ class Trainer:
     def _measure(self, log: TrainingLog | None) -> dict[str, float]:
         """Log and return the metrics on val; none where val is empty. Test is never read.
 
-        `val/error` is in training standard deviations, `val/<group>` in the group's unit.
+        `val/error` is in training standard deviations, without dimensions that hardly move;
+        `val/<group>` is in the group's unit.
         """
         assert log is not None
         ticks = evenly(self.split.val, self.source.eval_ticks or EVALUATION_TICKS)
@@ -299,7 +300,9 @@ class Trainer:
             feed=lambda plan: self.source.feed(plan, self.windows, self.device),
         )
         comparison = compare(predictions, {}, action_space(self.store, self.normalization))
-        metrics = {"val/error": comparison.overall("policy")} | {
+        # A joint that stands still in training, and elsewhere in val, would choose the checkpoint.
+        error = comparison.without_low_variance().overall("policy")
+        metrics = {"val/error": error} | {
             f"val/{group.key}": comparison.error("policy", group) for group in comparison.groups
         }
         log.write(self.step, metrics)

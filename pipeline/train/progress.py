@@ -152,6 +152,11 @@ def describe_data(
         lines.append(f"anchored at the newest frame: {', '.join(anchored)}")
     if not len(split.test):
         lines.append("split: nothing is test, so nothing is left for stages.evaluate to report on")
+    elif len(groups[-1]) == 1 and not cut and params.split.folds is None:
+        lines.append(
+            "split: errors on one test group have no interval; five folds test each recording once "
+            "(docs/training.md)"
+        )
     if split.note:
         lines.append(f"split: {split.note}")
     lost: list[str] = []

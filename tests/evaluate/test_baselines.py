@@ -67,6 +67,20 @@ def test_the_linear_fit_continues_what_is_linear(tiny_store: Make, tmp_path: Pat
     np.testing.assert_allclose(linear, recorded, atol=1e-4)
 
 
+def test_a_joint_that_stands_elsewhere_does_not_upset_the_linear_fit(
+    tiny_store: Make, tmp_path: Path, monkeypatch: Patch
+) -> None:
+    """It stands still in the training episodes, but for rounding, and elsewhere in the others."""
+    store = FeatureStore.open(tiny_store(tmp_path))
+    joints = {"names": [f"joint_{joint}" for joint in range(5)], "units": ["rad"] * 5}
+    monkeypatch.setattr(FeatureStore, "streams", store.streams | {"action": joints | ABSOLUTE})
+    action = store.array("tick/action")
+    action[:, 4] = 0.05 + 1e-6 * np.random.default_rng(0).standard_normal(store.ticks)
+    action[:60, 4] = -0.09
+    linear = Baselines(store, TRAIN, 4, None).act(np.arange(2, 30))["linear_fit"]
+    assert np.abs(linear).max() < 2 * np.abs(action).max()
+
+
 @pytest.mark.parametrize("width", [3, 256])
 def test_the_nearest_neighbour_of_a_training_tick_is_itself(
     store: FeatureStore, monkeypatch: Patch, width: int

@@ -118,7 +118,7 @@ def test_what_cannot_be_rolled_out_is_refused_by_name() -> None:
         driven("slide:Slide", action_hz=30.0)
     with pytest.raises(CheckpointMismatch, match="another robot than phantom"):
         driven("phantom")
-    with pytest.raises(ConfigError, match=r"rollout\.environment: slide:Sled: expected Sled"):
+    with pytest.raises(ConfigError, match=r"environment: slide:Sled: expected Sled.*Name a class"):
         environment("slide:Sled")
     with pytest.raises(ConfigError, match=r"expected `success` in the info .* found nothing"):
         driven("slide:Silent", towards_the_middle)

@@ -101,7 +101,10 @@ def test_the_text_has_both_tables_and_the_verdicts(comparison: Comparison) -> No
 def test_of_one_group_it_is_said_that_there_is_no_interval(
     recorded: Callable[..., Predictions], compared: Callable[[Predictions], Comparison]
 ) -> None:
-    assert error_text(compared(recorded(np.arange(30, 60), 0.1))).endswith(NO_INTERVAL)
+    text = error_text(compared(recorded(np.arange(30, 60), 0.1)))
+    assert NO_INTERVAL in text and text.endswith(
+        " five folds test each recording once (docs/training.md)"
+    )
 
 
 def test_dimensions_that_hardly_move_are_said_below_the_table(comparison: Comparison) -> None:

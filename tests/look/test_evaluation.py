@@ -144,7 +144,8 @@ def test_the_verdict_is_a_sentence(
     assert verdict in report.verdict
     advice = " ".join(block.words for block in section(report, "What to do next").blocks)
     assert ("docs/worse.md" in advice) == ("less" not in verdict)
-    assert "Hold out more" in advice and ("vla-cache rollout" in advice) == ("less" in verdict)
+    assert "Hold out more" in advice and "Five folds" in advice
+    assert ("vla-cache rollout" in advice) == ("less" in verdict)
 
 
 def test_an_anchored_policy_is_judged_by_rollouts(

@@ -68,6 +68,16 @@ def test_an_empty_glob_and_an_unknown_codebase_version(capsys, params_file, tmp_
     assert "v9.0" in refused(capsys, params_file)
 
 
+def test_an_absolute_path_is_watched_where_it_is_in_the_root(capsys, params_file, tmp_path):
+    source = write_raw(tmp_path / "lab/run", Truth())
+    sources = f"data.sources=[{{name: lab, path: {source}}}]"
+    assert "DVC" not in planned(capsys, params_file, sources)
+    other = tmp_path / "other"
+    other.mkdir()
+    said = planned(capsys, params_file, sources, f"data.root={other}")
+    assert f"{source} is outside data.root ({other}), so DVC does not watch it" in said
+
+
 def test_a_depth_map_that_is_asked_for_as_a_view(capsys, params_file, tmp_path):
     write_lerobot(tmp_path / "day1/run", iter([simulate_episode(4, 0.0)]))
     info = tmp_path / "day1/run/meta/info.json"

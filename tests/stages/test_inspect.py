@@ -57,6 +57,19 @@ def test_recordings_and_a_damaged_one_are_a_page(
     assert page.is_file() and len(list(page.parent.glob("*.png"))) >= 3
 
 
+def test_a_path_needs_no_params_file(
+    recorded: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Said
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert run("", inspect.main, [str(recorded)], shorthands=inspect.SHORTHANDS) == 0
+    out = capsys.readouterr().out
+    assert out.startswith("no params.yaml in this folder: every key has its default\n")
+    assert "episodes 1 · " in out and list(tmp_path.rglob("report.html"))
+    for words in ([], [str(recorded), "--params", "mine.yaml"]):
+        assert run("", inspect.main, words, shorthands=inspect.SHORTHANDS) == 2
+        assert ".yaml: no such file. Run from the project's root" in capsys.readouterr().err
+
+
 def test_a_zarr_group_of_somebody_else_is_named_and_not_to_be_replaced(
     looked: Make, tmp_path: Path, capsys: Said
 ) -> None:

@@ -64,7 +64,7 @@ def test_a_policy_of_another_robot_is_refused(
     assert run("", rollout.main, ["--params", str(path)]) == 2
     err = capsys.readouterr().err
     assert "trained on another robot than phantom: " in err
-    assert "set rollout.environment to null" in err
+    assert "metaworld:TASK (docs/rollout.md)" in err and "set rollout.environment to null" in err
     nothing = ["--set", "rollout.environment=null", "--set", f"rollout.output={tmp_path / 'none'}"]
     assert run("", rollout.main, ["--params", str(path), *nothing]) == 0
     assert json.loads((tmp_path / "none" / "metrics.json").read_text()) == {"success": {}}

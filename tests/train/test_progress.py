@@ -127,6 +127,21 @@ def test_groups_that_were_cut_by_time_count_once(store, params):
     shape = policy_shape(store, fit_normalization(store, thirds[0], WINDOWS))
     lines = describe_data(store, shape, params(), Split(*thirds, named, None))
     assert lines[1].endswith("of 1 + 1 + 1 groups (1 in all, cut by time)")
+    assert not any("five folds" in line for line in lines), "one recording has no folds"
+
+
+def test_one_test_group_of_several_is_too_few_for_an_interval(store, params):
+    """Episodes of 30 ticks, each a group."""
+    shape = policy_shape(store, fit_normalization(store, np.arange(30), WINDOWS))
+    named = {episode_name(episode): episode_name(episode) for episode in store.episodes}
+    few = Split(np.arange(30), np.arange(30, 60), np.arange(60, 90), named, None)
+    more = replace(few, test=np.arange(60, 120))
+    folds = params(split={"folds": 4})
+    said = [
+        "no interval; five folds test each" in "".join(describe_data(store, shape, *rest))
+        for rest in ((params(), few), (params(), more), (folds, few))
+    ]
+    assert said == [True, False, False]
 
 
 @pytest.fixture

@@ -61,6 +61,23 @@ def test_statistics_of_the_recorded_actions_stay(absolute, params, trainer, tmp_
     assert recorded.relative is None and relative.relative.mean.shape == (5,)
 
 
+def test_a_joint_that_stands_elsewhere_in_val_does_not_choose_the_checkpoint(
+    absolute, params, trainer, reseal, tmp_path
+):
+    path = tmp_path / "still.zarr"
+    shutil.copytree(absolute.path, path)
+    val = split_by_episode(absolute, params().split, params().horizon).val
+    action = np.memmap(path / "tick/action/c/0/0", np.float32, "r+", shape=(absolute.ticks, 5))
+    action[:, 3] = 0.05 + 1e-6 * np.random.default_rng(0).standard_normal(absolute.ticks)
+    action[val, 3] = -0.09
+    action.flush()
+    reseal(path)
+    write_seal(path)
+    done = trainer(FeatureStore.open(path), params())
+    done.fit()
+    assert done.stopping.best_error < 10
+
+
 def test_deltas_have_no_such_form(store, params, trainer):
     with pytest.raises(ConfigError, match=r"action_form: relative needs absolute actions"):
         trainer(store, params(action_form="relative"))

@@ -4,6 +4,7 @@ import inspect
 import json
 import shlex
 from collections.abc import Iterator, Sequence
+from copy import deepcopy
 from difflib import get_close_matches
 from itertools import islice
 from pathlib import Path
@@ -109,6 +110,11 @@ _SET = Border(
     "The value is YAML: put a text that it reads as something else in quotes of its own, as in "
     "--set 'section.key=\"a text\"'.",
 )
+_DEMO = {
+    "data": {"sources": [{"name": "demo", "path": "."}]},
+    "vlm": {"checkpoint": "models/demo_vlm"},
+}
+"""The keys that have no default, for the demo."""
 _REPLACED = {
     "train_head.val_fraction": "is no longer a key, because episodes are split three ways. Write "
     "train_head.split={val: 0.15, test: 0.15}: val chooses the checkpoint and stops early, test is "
@@ -122,15 +128,17 @@ _REPLACED = {
 """Keys of earlier versions, and their replacements."""
 
 
-def load_params(path: Path, overrides: Sequence[str] = ()) -> Params:
-    """The params of a YAML file after `section.key=value` overrides.
+def load_params(path: Path | None, overrides: Sequence[str] = ()) -> Params:
+    """The params of a YAML file after `section.key=value` overrides; of None, the defaults.
 
+    Without a file the keys that have no default are the demo's.
     A value is YAML, so `[1, 2]`, `null` and JSON work. Raises one `ConfigError` with every problem.
     """
-    document = _read(path)
+    document = deepcopy(_DEMO) if path is None else _read(path)
     for override in overrides:
         _lay_over(document, override)
-    where = f"{path} with what --set lays over it" if overrides else str(path)
+    where = "the defaults" if path is None else str(path)
+    where = f"{where} with what --set lays over it" if overrides else where
     return _as_section(document, Params, where)
 
 

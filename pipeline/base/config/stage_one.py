@@ -111,7 +111,7 @@ class DataParams(Section):
     """The recordings, and how they become ticks."""
 
     root: Place = Path("data/demo")
-    """Folder of recordings that DVC watches; it does not watch absolute source paths."""
+    """Folder of recordings that DVC watches; it does not watch source paths outside it."""
     sources: tuple[Source, ...] = Field(min_length=1)
     """Sets of recordings of one embodiment: the same action, state and sensor channels."""
     action_hz: float | None = Field(default=10.0, gt=0, le=1e4)
