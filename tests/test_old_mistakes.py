@@ -217,9 +217,7 @@ def raw_loss(batch: Any) -> float:
 
 
 @pytest.mark.parametrize("kind", ["rotvec", "euler_delta"])
-def test_9_a_turn_through_180_degrees_is_small(
-    recording: Recording, folder: Path, kind: Any
-) -> None:
+def test_9_a_turn_through_180_degrees_is_small(recording, folder, kind):
     poses = recording.poses()
     assert poses is not None
     data = UnifiedVLADataset(folder, action_rotation=kind)

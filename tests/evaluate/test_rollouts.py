@@ -107,9 +107,7 @@ def test_an_episode_is_the_same_alone_as_among_others() -> None:
     np.testing.assert_allclose(there.trace.offset_mm, here.trace.offset_mm, atol=1e-3)
 
 
-def test_real_time_chunking_gives_the_policy_what_is_left_of_its_plan(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_real_time_chunking_gives_the_policy_what_is_left_of_its_plan(monkeypatch):
     parts = made("flow_matching")
     act, guides, chunks = parts[1].act, [], []
 
@@ -155,9 +153,7 @@ def test_the_model_gets_the_views_and_the_task_that_the_policy_was_trained_on() 
 
 
 @pytest.mark.parametrize("latency_ms", [0, 400])
-def test_what_the_policy_sees_is_as_old_as_it_says(
-    latency_ms: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_the_policy_sees_is_as_old_as_it_says(latency_ms, monkeypatch):
     parts = made()
     given = watch(monkeypatch, parts[1])
     rolled(parts, ablations=(), episodes=1, latency_ms=latency_ms)
@@ -203,9 +199,7 @@ def test_a_stream_that_is_off_says_nothing(monkeypatch: pytest.MonkeyPatch) -> N
 
 
 @pytest.mark.parametrize("stream", ["features", "state"])
-def test_a_frozen_stream_tells_what_it_told_first(
-    stream: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_frozen_stream_tells_what_it_told_first(stream, monkeypatch):
     parts = made()
     given = watch(monkeypatch, parts[1])
     rollouts = rolled(parts, episodes=2, ablations=(f"{stream} frozen",))

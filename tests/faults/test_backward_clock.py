@@ -21,9 +21,7 @@ def backwards(recordings: Path, write_episode: Callable[..., Path]) -> Path:
     return file
 
 
-def test_it_is_refused_or_skipped_and_changes_nothing(
-    backwards: Path, store: Path, params: Path, here
-) -> None:
+def test_it_is_refused_or_skipped_and_changes_nothing(backwards, store, params, here):
     before = content(store)
     code, _, complained = here("stages.extract", params)
     assert code == 2

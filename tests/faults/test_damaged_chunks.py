@@ -62,8 +62,8 @@ def right(extracted, write_episode, tmp_path_factory) -> FeatureStore:
 
 @each_harm
 def test_an_extraction_beside_it_takes_no_wrong_row(
-    document, store: Path, recordings: Path, write_episode, right: FeatureStore, harm, chunk
-) -> None:
+    document, store, recordings, write_episode, right, harm, chunk
+):
     """Of the old store only rows that give their checksums are taken; streams are read anew."""
     write_episode(recordings / "Touch_dot" / "episode_4", 4)
     HARMS[harm](store / chunk)

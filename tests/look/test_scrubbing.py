@@ -2,7 +2,6 @@
 
 import re
 import sys
-from collections.abc import Callable
 from pathlib import Path
 from subprocess import run
 
@@ -57,9 +56,7 @@ def test_a_recording_is_there_with_all_that_moves_in_it(tmp_path: Path) -> None:
 
 
 @pytest.mark.extra
-def test_a_store_is_there_with_the_similarity_of_its_rows(
-    tiny_store: Callable[..., Path], tmp_path: Path
-) -> None:
+def test_a_store_is_there_with_the_similarity_of_its_rows(tiny_store, tmp_path):
     pytest.importorskip("rerun")
     path = tiny_store(tmp_path)
     params = params_of(path, tmp_path / "out")
@@ -70,9 +67,7 @@ def test_a_store_is_there_with_the_similarity_of_its_rows(
     assert rows["state"] == len(episode.states)
 
 
-def test_without_rerun_the_error_says_what_to_install(
-    tiny_store: Callable[..., Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_without_rerun_the_error_says_what_to_install(tiny_store, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "rerun", None)
     params = params_of(tiny_store(tmp_path), tmp_path / "out")
     with pytest.raises(ConfigError, match=r"\[rerun\]"):

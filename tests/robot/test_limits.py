@@ -175,9 +175,7 @@ def test_a_velocity_is_a_speed_and_goes_on_where_nothing_is_sent_but_a_place_is_
         ("state", 8, 200.0, StopKind.WORKSPACE),
     ],
 )
-def test_the_examples_limits_of_what_is_measured_stop_the_phantom(
-    stream: str, channel: int, value: float, kind: StopKind
-) -> None:
+def test_the_examples_limits_of_what_is_measured_stop_the_phantom(stream, channel, value, kind):
     insertion = NeedleInsertion()
     insertion.reset(3)
     observed = {"state": insertion.state.copy(), "sensor": insertion.sensor.copy()}

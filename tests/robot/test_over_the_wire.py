@@ -38,8 +38,8 @@ def over_the_wire(served: Any, serving: Served, **changed: Any) -> Rollouts:
     ],
 )
 def test_the_same_seed_gives_the_same_episode_bit_for_bit(
-    model_type: str, changed: dict[str, Any], served_policy, serving
-) -> None:
+    model_type, changed, served_policy, serving
+):
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:

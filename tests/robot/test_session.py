@@ -2,7 +2,6 @@
 
 import threading
 from collections import deque
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -19,8 +18,6 @@ from pipeline.simulation.environment import InsertionEnvironment
 from pipeline.simulation.insertion import INSTRUCTION
 from pipeline.simulation.rendering import VIEWS
 
-Observe = Callable[..., dict[str, Any]]
-Served = Callable[..., Any]
 SEED = 78
 BLIND: dict[str, Any] = {f"images/{view}": None for view in VIEWS}
 
@@ -43,9 +40,7 @@ def drive(session: Session) -> list[np.ndarray]:
     return sent
 
 
-def test_a_session_does_bit_for_bit_what_a_rollout_does(
-    phantom_policy, served_policy, monkeypatch
-) -> None:
+def test_a_session_does_bit_for_bit_what_a_rollout_does(phantom_policy, served_policy, monkeypatch):
     """The other experts and chunkings are those of `test_over_the_wire`."""
     sent: list[np.ndarray] = []
     step = InsertionEnvironment.step
@@ -143,7 +138,7 @@ def test_a_missing_view_is_left_out_as_in_training(served_policy, observe, monke
 
 def test_without_frames_the_first_observation_is_refused_and_leaves_a_session_that_works(
     served_policy, observe
-) -> None:
+):
     session = served_policy().session()
     with pytest.raises(ObservationError, match="images/View1"):
         session.infer(observe(0, **BLIND))
@@ -250,7 +245,7 @@ def test_an_answer_that_is_no_number_is_refused(served_policy, observe, monkeypa
 
 def test_the_first_frames_and_states_of_each_episode_are_looked_at_before_the_model_looks(
     served_policy, observe
-) -> None:
+):
     class Suspicious:
         """A first look that remembers what it saw, and refuses at last."""
 

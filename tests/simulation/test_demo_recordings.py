@@ -156,9 +156,7 @@ def quick_sets(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     return written
 
 
-def test_finished_sets_are_kept_and_other_params_replace_the_demos_own(
-    quick_sets: list[str], tmp_path: Path
-) -> None:
+def test_finished_sets_are_kept_and_other_params_replace_the_demos_own(quick_sets, tmp_path):
     write_demo_recordings(tmp_path, 2, 0)
     write_demo_recordings(tmp_path, 2, 0)
     assert sorted(quick_sets) == sorted(SETS)

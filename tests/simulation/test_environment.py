@@ -131,9 +131,7 @@ def robot(request: pytest.FixtureRequest, clock: Clock) -> Iterator[SimulatedRob
         yield made
 
 
-def test_an_action_is_a_tick_and_tells_the_readings_of_the_simulation(
-    robot: SimulatedRobot, clock: Clock
-) -> None:
+def test_an_action_is_a_tick_and_tells_the_readings_of_the_simulation(robot, clock):
     environment = InsertionEnvironment(cameras=False)
     readings, _ = environment.reset(seed=3)
     for tick in range(3):
@@ -152,9 +150,7 @@ def test_an_action_is_a_tick_and_tells_the_readings_of_the_simulation(
 
 
 @pytest.mark.parametrize(("waited", "ticks"), [(0.9, 0), (1.96, 2), (2.2, 2)])
-def test_ticks_without_an_action_pass_all_the_same(
-    robot: SimulatedRobot, clock: Clock, waited: float, ticks: int
-) -> None:
+def test_ticks_without_an_action_pass_all_the_same(robot, clock, waited, ticks):
     first = robot.observe()
     clock.now_s += waited / robot._hz
     later = robot.observe()

@@ -80,9 +80,7 @@ def arguments(trained: Path, output: Path, *overrides: str) -> list[str]:
 
 
 @pytest.mark.usefixtures("reports")
-def test_a_store_that_grew_is_judged_on_the_same_episodes(
-    trained: Path, judged: tuple[Path, str], tiny_store: Callable[..., Path], tmp_path: Path
-) -> None:
+def test_a_store_that_grew_is_judged_on_the_same_episodes(trained, judged, tiny_store, tmp_path):
     report, said = judged
     assert "30 test ticks of 1 episode(s)" in said
     grown = f"evaluate.store={tiny_store(tmp_path, episodes=9)}"
@@ -97,14 +95,7 @@ def test_a_store_that_grew_is_judged_on_the_same_episodes(
         ({"seed": 1}, "recordings than they were: right/episode_005"),
     ],
 )
-def test_another_store_is_refused_by_name(
-    trained: Path,
-    tiny_store: Callable[..., Path],
-    tmp_path: Path,
-    capsys: Said,
-    store: dict[str, object],
-    message: str,
-) -> None:
+def test_another_store_is_refused_by_name(trained, tiny_store, tmp_path, capsys, store, message):
     other = f"evaluate.store={tiny_store(tmp_path, name='other', **store)}"
     assert run("", evaluate.main, ["--params", str(trained), "--set", other]) == 2
     assert message in capsys.readouterr().err
@@ -112,12 +103,8 @@ def test_another_store_is_refused_by_name(
 
 @pytest.mark.usefixtures("reports")
 def test_a_flipped_bit_is_refused_where_it_would_be_judged_on(
-    trained: Path,
-    tiny_store: Callable[..., Path],
-    flip: Callable[[Path, str], Path],
-    tmp_path: Path,
-    capsys: Said,
-) -> None:
+    trained, tiny_store, flip, tmp_path, capsys
+):
     store = tiny_store(tmp_path, name="flipped")
     file = flip(store, "vl/features")
     told = arguments(trained, tmp_path / "report", f"evaluate.store={store}")
@@ -127,9 +114,7 @@ def test_a_flipped_bit_is_refused_where_it_would_be_judged_on(
     assert run("", evaluate.main, [*told, "--set", "evaluate.check_store=false"]) == 0
 
 
-def test_what_cannot_be_evaluated_says_what_to_do(
-    trained: Path, tmp_path: Path, capsys: Said
-) -> None:
+def test_what_cannot_be_evaluated_says_what_to_do(trained, tmp_path, capsys):
     for override, message in (
         (f"evaluate.checkpoint={tmp_path / 'nowhere'}", "Run stages.train_head"),
         ("evaluate.execute=9", "evaluate.execute 9: expected at most the 8 steps"),
@@ -140,8 +125,8 @@ def test_what_cannot_be_evaluated_says_what_to_do(
 
 @pytest.mark.usefixtures("reports")
 def test_without_a_checkpoint_it_judges_what_train_head_wrote(
-    trained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Said
-) -> None:
+    trained, tmp_path, monkeypatch, capsys
+):
     """Not an older head that lies where heads lie by default."""
     shutil.copytree(trained.parent / "head", tmp_path / "models/head")
     monkeypatch.chdir(tmp_path)
@@ -154,9 +139,7 @@ def test_without_a_checkpoint_it_judges_what_train_head_wrote(
 
 
 @pytest.mark.usefixtures("reports")
-def test_a_policy_outlives_the_renaming_of_its_source(
-    trained: Path, judged: tuple[Path, str], tmp_path: Path, capsys: Said
-) -> None:
+def test_a_policy_outlives_the_renaming_of_its_source(trained, judged, tmp_path, capsys):
     renamed = Path(shutil.copytree(trained.parent / "tiny.zarr", tmp_path / "renamed.zarr"))
     document = json.loads((renamed / "zarr.json").read_text())
     document["attributes"]["sources"] = ["gauche", "droite"]
@@ -172,9 +155,7 @@ def test_a_policy_outlives_the_renaming_of_its_source(
     assert after == before
 
 
-def test_the_report_says_what_was_judged_and_which_streams_are_used(
-    judged: tuple[Path, str],
-) -> None:
+def test_the_report_says_what_was_judged_and_which_streams_are_used(judged):
     """One test episode: nothing can be shuffled or drawn anew, and the report says so."""
     report, said = judged
     assert "sensor    zeroed" in said
@@ -194,9 +175,7 @@ def test_the_report_says_what_was_judged_and_which_streams_are_used(
     assert f"No frames: there is no recording at {place} any more." in page
 
 
-def test_the_same_judgement_is_the_same_bytes_wherever_it_is_written(
-    trained: Path, judged: tuple[Path, str], tmp_path: Path
-) -> None:
+def test_the_same_judgement_is_the_same_bytes_wherever_it_is_written(trained, judged, tmp_path):
     output = f"evaluate.output={tmp_path / 'else' / 'where'}"
     assert run("", evaluate.main, ["--params", str(trained), "--set", output]) == 0
     first, second = (
@@ -206,9 +185,7 @@ def test_the_same_judgement_is_the_same_bytes_wherever_it_is_written(
     assert first == second and "report.html" in first
 
 
-def test_a_report_says_that_the_logs_are_gone(
-    trained: Path, tmp_path: Path, reports: list[Report]
-) -> None:
+def test_a_report_says_that_the_logs_are_gone(trained, tmp_path, reports):
     logs = shutil.move(trained.parent / "logs", tmp_path / "logs")
     try:
         assert run("", evaluate.main, arguments(trained, tmp_path / "report")) == 0
@@ -220,9 +197,7 @@ def test_a_report_says_that_the_logs_are_gone(
     assert "curves" not in {picture.name for picture in report.blocks(Picture)}
 
 
-def test_streams_are_left_alone_where_nobody_asks(
-    trained: Path, tmp_path: Path, reports: list[Report]
-) -> None:
+def test_streams_are_left_alone_where_nobody_asks(trained, tmp_path, reports):
     """DVC misses no file of such an evaluation either."""
     listed = re.findall(r"evaluate\.output}/([\w.]+)", (ROOT / "dvc.yaml").read_text())
     output = tmp_path / "report"
@@ -260,9 +235,7 @@ def test_a_sampling_policy_is_judged_on_one_sample(trained: Path, tmp_path: Path
     assert many["samples"]["best_of_n"]["value"] < error
 
 
-def test_the_rollouts_of_this_policy_are_linked_though_they_come_later(
-    trained: Path, tmp_path: Path, reports: list[Report]
-) -> None:
+def test_the_rollouts_of_this_policy_are_linked_though_they_come_later(trained, tmp_path, reports):
     for checkpoint in ("null", "models/another"):
         rollout = {
             "environment": "phantom",

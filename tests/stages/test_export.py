@@ -31,9 +31,7 @@ def exported(trained: Path, *overrides: str) -> int:
     return run("", export.main, ["--params", str(trained), *told])
 
 
-def test_the_trained_head_is_exported_with_its_receipt(
-    trained: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_trained_head_is_exported_with_its_receipt(trained, capsys):
     assert exported(trained, "export.formats=[torch]") == 0
     assert "head.pt2, receipt.json" in capsys.readouterr().out
     receipt = json.loads((trained.parent / "export/receipt.json").read_text())
@@ -42,12 +40,7 @@ def test_the_trained_head_is_exported_with_its_receipt(
     assert receipt["files"]["head.pt2"]["deviation"]["random"]["std"] < 1e-5
 
 
-def test_what_is_missing_is_said_in_one_message(
-    trained: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_what_is_missing_is_said_in_one_message(trained, tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "onnxruntime", None)
     assert exported(trained, f"export.output={tmp_path / 'new'}") == 2
     assert "pip install 'vla-feature-cache[export]'" in capsys.readouterr().err

@@ -37,9 +37,7 @@ def looked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, demo_checkpoint: Pat
     return look
 
 
-def test_recordings_and_a_damaged_one_are_a_page(
-    looked: Make, recorded: Path, tmp_path: Path, capsys: Said
-) -> None:
+def test_recordings_and_a_damaged_one_are_a_page(looked, recorded, tmp_path, capsys):
     (episode,) = recorded.iterdir()
     for name in ("sound", "broken"):
         shutil.copytree(episode, tmp_path / "lab" / name)
@@ -57,9 +55,7 @@ def test_recordings_and_a_damaged_one_are_a_page(
     assert page.is_file() and len(list(page.parent.glob("*.png"))) >= 3
 
 
-def test_a_zarr_group_of_somebody_else_is_named_and_not_to_be_replaced(
-    looked: Make, tmp_path: Path, capsys: Said
-) -> None:
+def test_a_zarr_group_of_somebody_else_is_named_and_not_to_be_replaced(looked, tmp_path, capsys):
     group = zarr.create_group(tmp_path / "umi.zarr", zarr_format=2)
     group.create_array("data/action", shape=(3,), dtype="f4")
     assert looked("umi.zarr") == 2
@@ -69,8 +65,8 @@ def test_a_zarr_group_of_somebody_else_is_named_and_not_to_be_replaced(
 
 
 def test_a_korean_name_lacks_a_font_and_grey_frames_of_16_bits_are_not_white(
-    looked: Make, tmp_path: Path, capsys: Said, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    looked, tmp_path, capsys, monkeypatch
+):
     """Where a warning a letter came through, it would be an error here."""
     episode = write_raw(tmp_path / "바늘_삽입", Truth(), views=("View1",))
     for number, frame in enumerate(sorted(episode.rglob("*.jpg"))):
@@ -93,9 +89,7 @@ def test_a_store_is_a_page(looked: Make, tiny_store: Make, tmp_path: Path, capsy
     assert (tmp_path / "mine/report.html").is_file()
 
 
-def test_what_cannot_be_inspected_is_refused(
-    looked: Make, tiny_store: Make, tmp_path: Path, capsys: Said
-) -> None:
+def test_what_cannot_be_inspected_is_refused(looked, tiny_store, tmp_path, capsys):
     from pipeline.store.archive import archive
 
     (tmp_path / "empty").mkdir()

@@ -40,9 +40,7 @@ def test_a_whole_folder(params: Make, demo_checkpoint: Path) -> None:
     assert fits.message.startswith("9.6 MiB in float32, memory has")
 
 
-def test_the_demos_random_weights_are_nothing_to_learn_from(
-    params: Make, demo_checkpoint: Path, tmp_path: Path
-) -> None:
+def test_the_demos_random_weights_are_nothing_to_learn_from(params, demo_checkpoint, tmp_path):
     """Wherever the folder that stages.demo marks lies."""
     mine = shutil.copytree(demo_checkpoint, tmp_path / "mine")
     (mine / MARKER).write_text('{"seed": 0}')
@@ -52,9 +50,7 @@ def test_the_demos_random_weights_are_nothing_to_learn_from(
     assert "Qwen/Qwen2.5-VL-3B-Instruct" in here.remedy and "docs/real-model.md" in here.remedy
 
 
-def test_a_folder_with_a_hole_or_a_file_that_is_cut_off(
-    params: Make, demo_checkpoint: Path, tmp_path: Path
-) -> None:
+def test_a_folder_with_a_hole_or_a_file_that_is_cut_off(params, demo_checkpoint, tmp_path):
     broken = shutil.copytree(demo_checkpoint, tmp_path / "broken")
     weights = next(broken.glob("*.safetensors"))
     whole = weights.read_bytes()
@@ -103,9 +99,7 @@ def test_an_adapter(tmp_path: Path) -> None:
         ("float32", [], 16, "note"),
     ],
 )
-def test_seven_billion_parameters_fit_or_not(
-    params: Make, dtype: str, gpus: list[int], available: int, level: str
-) -> None:
+def test_seven_billion_parameters_fit_or_not(params, dtype, gpus, available, level):
     found = [GPU(f"GPU {gib}", gib * GIB, True) for gib in gpus]
     issue = check_fit(7_000_000_000, params("a/b", dtype=dtype).vlm, found, available * GIB)
     assert issue.severity == level

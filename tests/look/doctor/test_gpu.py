@@ -66,8 +66,8 @@ def test_gpus_that_are_seen() -> None:
     ],
 )
 def test_flash_attention_is_needed_only_where_it_is_asked_for(
-    monkeypatch: pytest.MonkeyPatch, installed: bool, device: str, asked: str, severity: str
-) -> None:
+    monkeypatch, installed, device, asked, severity
+):
     monkeypatch.setattr("pipeline.vlm.loading.is_flash_attn_2_available", lambda: installed)
     vlm = params(vlm={"checkpoint": "a/b", "attention": asked}).vlm
     issue = check_attention(vlm, torch.device(device))

@@ -41,9 +41,7 @@ def _refuse(params: Params) -> None:
         (lambda params: [missing("it", "is not there", "get it")], "is not there"),
     ],
 )
-def test_what_cannot_be_looked_at_is_an_issue(
-    params: Params, monkeypatch: pytest.MonkeyPatch, check: Any, said: str
-) -> None:
+def test_what_cannot_be_looked_at_is_an_issue(params, monkeypatch, check, said):
     def load(name: str) -> Any:
         if isinstance(check, Exception):
             raise check

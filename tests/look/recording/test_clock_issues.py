@@ -76,9 +76,7 @@ def test_a_stream_that_ends_early(find: Find) -> None:
 
 
 @pytest.mark.parametrize("start", [0.3, -0.3])
-def test_what_a_late_or_early_stream_costs_is_judged_by_the_episode(
-    find: Find, start: float
-) -> None:
+def test_what_a_late_or_early_stream_costs_is_judged_by_the_episode(find, start):
     """Three of 32 ticks are a tenth of what there is to learn from."""
     short = {name: time[time < 3.2] for name, time in (("sensor", FAST), ("state", SLOW))}
     time = short["sensor"]

@@ -129,9 +129,7 @@ def test_a_view_that_cannot_be_decoded_is_left_out(copied, look: Look) -> None:
     assert "cannot be decoded" in issue.message
 
 
-def test_a_disk_that_fails_while_frames_are_read(
-    copied: Callable[[str], Path], look: Look, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_disk_that_fails_while_frames_are_read(copied, look, monkeypatch):
     view = look(copied("raw"))
     failing = view.cameras["View2"]
 

@@ -35,12 +35,7 @@ def words_of(report: Report) -> str:
 
 
 @pytest.mark.slow
-def test_the_page_of_a_recording_is_sound(
-    recorded: Path,
-    params_of: Callable[..., Params],
-    tmp_path: Path,
-    assert_page_is_sound: Callable[[Path], None],
-) -> None:
+def test_the_page_of_a_recording_is_sound(recorded, params_of, tmp_path, assert_page_is_sound):
     report = report_of(params_of(recorded, "inspect.samples=2", "inspect.ticks=2"))
     assert_page_is_sound(write_report(tmp_path, report)[0])
 
@@ -64,9 +59,7 @@ def test_the_page_of_a_recording_is_whole(recorded: Path, params_of: Callable[..
     ]
 
 
-def test_what_is_missing_is_said(
-    recorded: Path, params_of: Callable[..., Params], tmp_path: Path
-) -> None:
+def test_what_is_missing_is_said(recorded, params_of, tmp_path):
     lab = Path(shutil.copytree(recorded, tmp_path / "lab"))
     (folder,) = lab.iterdir()
     sensor = next(path for path in folder.iterdir() if "sensor" in path.name)
@@ -83,9 +76,7 @@ def test_what_is_missing_is_said(
     assert folder.name in first.issues[0].episode
 
 
-def test_all_episodes_are_checked_and_some_are_shown(
-    recorded: Path, params_of: Callable[..., Params], tmp_path: Path
-) -> None:
+def test_all_episodes_are_checked_and_some_are_shown(recorded, params_of, tmp_path):
     (episode,) = recorded.iterdir()
     for index in range(4):
         shutil.copytree(episode, tmp_path / f"episode_{index}")

@@ -36,7 +36,6 @@ PARAMS = Params.model_validate(
     }
 )
 Felt = Callable[..., EpisodeView]
-Words = Callable[[Figure], str]
 
 
 def test_views_are_shown_at_ticks_with_the_age_of_each_frame(view: EpisodeView) -> None:
@@ -147,9 +146,7 @@ def test_lanes_show_every_clock_once_with_its_gap(view: EpisodeView) -> None:
     assert near.get_xlim()[0] < gap.start_s - view.zero < near.get_xlim()[1]
 
 
-def test_lines_lead_from_the_frame_to_its_row_and_from_there_to_its_ticks(
-    view: EpisodeView,
-) -> None:
+def test_lines_lead_from_the_frame_to_its_row_and_from_there_to_its_ticks(view):
     assert view.timeline is not None
     line, (_, near) = view.timeline, draw_lanes(view).axes
     lines = [lines for lines in near.collections if isinstance(lines, LineCollection)]

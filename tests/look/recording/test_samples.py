@@ -77,9 +77,7 @@ def test_samples_follow_the_seed_and_are_never_more_than_ticks(healthy: Path, lo
     assert len(ticks(1000, 0)) == len(view.timeline.time)
 
 
-def test_of_an_episode_that_training_refuses_there_is_no_sample(
-    copied: Callable[[str], Path], look: Look
-) -> None:
+def test_of_an_episode_that_training_refuses_there_is_no_sample(copied, look):
     folder = copied("raw")
     next(folder.glob("sensor_data_*.npz")).write_bytes(b"no archive")
     with pytest.raises(RecordingError, match="sensor_data"):
@@ -102,9 +100,7 @@ def side_by_side(view: EpisodeView, samples: list[Sample], params: Params) -> Fi
     return draw_samples(view, samples, window_lengths(params))
 
 
-def test_samples_have_a_column_each_and_say_what_they_reuse(
-    view: EpisodeView, samples: list[Sample], side_by_side: Figure
-) -> None:
+def test_samples_have_a_column_each_and_say_what_they_reuse(view, samples, side_by_side):
     # Three views, force, A-scan, state in deg and mm, action in mm, deg and gripper.
     assert len(side_by_side.axes) == 3 * 10
     tick, title = samples[1].tick, side_by_side.axes[1].get_title()
