@@ -79,7 +79,7 @@ def pictures(comparison: Comparison, predictions: Predictions, store: Any) -> di
 
 
 @pytest.mark.parametrize(
-    ("episodes", "dimensions", "constant", "horizon"), [(3, 14, 1, 20), (1, 1, 0, 1)]
+    ("episodes", "dimensions", "constant", "horizon"), [(2, 6, 1, 8), (1, 1, 0, 1)]
 )
 def test_every_picture_is_written(tmp_path, episodes, dimensions, constant, horizon):
     shown = evaluated(episodes, dimensions, constant=constant, horizon=horizon)

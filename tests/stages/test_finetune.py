@@ -99,7 +99,10 @@ def test_a_flipped_bit_is_refused_before_tuning(write_params, extracted, flip, t
     assert not (tmp_path / "tuned.part").exists()
 
 
-def test_it_tunes_and_says_how_to_go_on_and_that_works(write_params, extracted, tmp_path, capsys):
+def test_it_tunes_and_says_how_to_go_on_and_that_works(
+    write_params, extracted, tmp_path, capsys, monkeypatch
+):
+    monkeypatch.setattr("pipeline.look.page.writing.write_report", lambda *_: [])
     params, seed = str(write_params()), "train_head.seed=1"
     assert run("", finetune.main, ["--params", params, "--set", seed]) == 0
     captured = capsys.readouterr()
