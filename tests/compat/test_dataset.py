@@ -2,7 +2,6 @@
 
 import json
 import pickle
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -266,15 +265,6 @@ class TestErrors:
             AsyncInsertionMeca500DatasetWithSensor(recordings / "new")
         with pytest.raises(StoreIncomplete, match=r"nowhere\.zarr"):
             UnifiedVLADataset(store=tmp_path / "nowhere.zarr")
-
-    def test_every_broken_episode_is_named(self, copied: Callable[[str], Path]) -> None:
-        folder = copied("new")
-        for metadata in folder.glob("**/metadata.json"):
-            metadata.write_text("{")
-        with pytest.raises(
-            RecordingError, match=r"(?s)2 episodes.*_092140/metadata.*_092320/metadata"
-        ):
-            UnifiedVLADataset(folder)
 
 
 class TestSplit:

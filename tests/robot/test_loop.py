@@ -16,8 +16,6 @@ from pipeline.robot.loop import (
     ControlLoop,
     Executor,
     PlanGuide,
-    SafeStop,
-    StopKind,
     check_chunking,
     soft_mask,
 )
@@ -334,50 +332,3 @@ def test_a_policy_without_features_needs_no_frames() -> None:
     loop = make_loop(uses_features=False)
     loop.begin_tick()
     assert not loop.frames_due and loop.chunk_due
-
-
-def test_a_refused_question_is_asked_again_with_its_frames_and_no_other_pass_is_touched() -> None:
-    loop = make_loop()
-    for _ in range(2):
-        loop.begin_tick()
-        assert loop.frames_due and loop.chunk_due
-        loop.pass_began()
-        loop.ask()
-        loop.refused()
-    loop.begin_tick()
-    loop.pass_began()
-    loop.ask()
-    loop.plan(chunk_of(0))
-    for _ in range(3):
-        loop.action()
-        loop.begin_tick()
-        assert loop.chunk_due
-        loop.ask()
-        loop.refused()
-    assert not loop.frames_due, "the pass is still under way"
-    loop.pass_ended()
-    assert loop.frames_due
-
-
-def test_a_plan_that_is_used_up_is_a_safe_stop() -> None:
-    loop = make_loop(uses_features=False)
-    loop.begin_tick()
-    loop.ask()
-    loop.plan(chunk_of(1))
-    for _ in range(HORIZON):
-        loop.action()
-    with pytest.raises(SafeStop) as stopped:
-        loop.action()
-    assert stopped.value.kind == StopKind.NO_CHUNK
-
-
-@pytest.mark.parametrize("bad", [np.nan, np.inf])
-def test_an_action_that_is_no_number_is_a_safe_stop(bad: float) -> None:
-    loop = make_loop(uses_features=False)
-    loop.begin_tick()
-    loop.ask()
-    chunk = np.zeros((HORIZON, 2), np.float32)
-    chunk[-1, 1] = bad
-    with pytest.raises(SafeStop, match="not a number") as stopped:
-        loop.plan(chunk)
-    assert stopped.value.kind == StopKind.NOT_A_NUMBER

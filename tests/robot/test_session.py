@@ -8,9 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from pipeline.base.config import RolloutParams
 from pipeline.base.errors import NumericsError, ObservationError
-from pipeline.evaluate.rollout_driver import roll_out
 from pipeline.policy.observation import moving_channels
 from pipeline.robot.loop import Executor
 from pipeline.robot.session import Session
@@ -38,31 +36,6 @@ def drive(session: Session) -> list[np.ndarray]:
         sent.append(executor.next_action().astype(np.float64))
         readings, reset = robot.step(sent[-1])[0], {}
     return sent
-
-
-def test_a_session_does_bit_for_bit_what_a_rollout_does(phantom_policy, served_policy, monkeypatch):
-    """The other experts and chunkings are those of `test_over_the_wire`."""
-    sent: list[np.ndarray] = []
-    step = InsertionEnvironment.step
-
-    def watched(robot: Any, action: np.ndarray) -> Any:
-        sent.append(action.copy())
-        return step(robot, action)
-
-    checkpoint, policy, glance = phantom_policy("diffusion")
-    with monkeypatch.context() as patch:
-        patch.setattr(InsertionEnvironment, "step", watched)
-        wanted = {"episodes": 1, "seed": SEED, "ablations": (), "chunking": "none"}
-        load: Any = lambda: glance  # noqa: E731
-        rolled = roll_out(checkpoint, "head", policy, load, RolloutParams.model_validate(wanted))
-    (episode,) = rolled.of("policy")
-    assert torch.get_num_threads() == 1
-    served = served_policy("diffusion")
-    actions = drive(served.session())
-    # The demonstrator's actions came after those of the policy.
-    np.testing.assert_array_equal(actions, sent[: episode.actions])
-    assert len(actions) > 20
-    assert len(served.glance.passes) == len(glance.passes)
 
 
 def test_an_answer_says_what_it_was_made_of(served_policy, observe) -> None:

@@ -137,17 +137,6 @@ def test_folds_become_one_row_of_all_groups(experiments: Path) -> None:
     shutil.rmtree(reports)
 
 
-def test_another_store_or_other_ticks_are_refused_by_name(reports, experiments, capsys):
-    path = reports / "regression-gated" / JUDGED
-    document = json.loads(path.read_text())
-    document["on"]["action_hz"] = 5
-    next(iter(document["on"]["test"].values()))["ticks"] = [3, 30]
-    path.write_text(json.dumps(document))
-    error = refused(reports, experiments, capsys)
-    assert "5 (regression-gated)" in error
-    assert "[3, 30] (regression-gated)" in error
-
-
 def test_policies_that_were_sampled_otherwise_are_refused(reports, experiments, capsys):
     path = reports / "diffusion-concat" / JUDGED
     document = json.loads(path.read_text())

@@ -70,24 +70,6 @@ def test_stopped_while_it_writes_the_same_command_goes_on(params, tmp_path, monk
 
 
 @pytest.mark.usefixtures("calls")
-def test_a_checkpoint_that_the_demo_did_not_write_is_left_alone(params, tmp_path, capsys):
-    (tmp_path / "vlm").mkdir()
-    (tmp_path / "vlm" / "weights").write_text("real", encoding="utf-8")
-    assert ran(params) == 2
-    err = capsys.readouterr().err
-    assert "demo.checkpoint" in err and str(tmp_path / "vlm") in err
-    assert (tmp_path / "vlm" / "weights").read_text(encoding="utf-8") == "real"
-    assert not (tmp_path / "recordings").exists()
-
-
-def test_foreign_recordings_end_with_2_and_no_checkpoint(params, tmp_path, capsys):
-    (tmp_path / "recordings" / "precious").mkdir(parents=True)
-    assert ran(params) == 2
-    assert "demo.recordings" in capsys.readouterr().err
-    assert not (tmp_path / "vlm").exists()
-
-
-@pytest.mark.usefixtures("calls")
 def test_what_a_user_put_among_the_demos_files_is_left_alone(params, tmp_path, capsys):
     assert ran(params) == 0
     (tmp_path / "vlm/model.safetensors").write_text("mine", encoding="utf-8")

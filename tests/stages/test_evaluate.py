@@ -14,12 +14,9 @@ import yaml
 
 from pipeline.look.page import writing
 from pipeline.look.page.blocks import Picture, Report, Text
-from pipeline.store.archive import archive
 from pipeline.store.chunks import write_seal
 from stages import evaluate, train_head
 from stages.command import run
-
-Said = pytest.CaptureFixture[str]
 
 ROOT = Path(__file__).resolve().parents[2]
 PICTURES = (
@@ -86,19 +83,6 @@ def test_a_store_that_grew_is_judged_on_the_same_episodes(trained, judged, tiny_
     grown = f"evaluate.store={tiny_store(tmp_path, episodes=9)}"
     assert run("", evaluate.main, arguments(trained, tmp_path / "report", grown)) == 0
     assert (tmp_path / "report/judged.json").read_bytes() == (report / "judged.json").read_bytes()
-
-
-@pytest.mark.parametrize(
-    ("store", "message"),
-    [
-        ({"spec_digest": "other"}, 'feature_spec.digest: "tiny-spec" -> "other"'),
-        ({"seed": 1}, "recordings than they were: right/episode_005"),
-    ],
-)
-def test_another_store_is_refused_by_name(trained, tiny_store, tmp_path, capsys, store, message):
-    other = f"evaluate.store={tiny_store(tmp_path, name='other', **store)}"
-    assert run("", evaluate.main, ["--params", str(trained), "--set", other]) == 2
-    assert message in capsys.readouterr().err
 
 
 @pytest.mark.usefixtures("reports")
@@ -246,12 +230,3 @@ def test_the_rollouts_of_this_policy_are_linked_though_they_come_later(trained, 
         assert run("", evaluate.main, arguments(trained, tmp_path / "report", *overrides)) == 0
     pages = [{text.page for text in report.blocks(Text)} - {""} for report in reports]
     assert pages == [{"../rollout/report.html"}, set()]
-
-
-def test_an_archive_has_to_be_restored_first(trained: Path, tmp_path: Path, capsys: Said) -> None:
-    packed = tmp_path / "tiny.archive.zarr"
-    archive(trained.parent / "tiny.zarr", packed, level=1, threads=1)
-    told = arguments(trained, tmp_path / "report", f"extract.store={packed}")
-    for command in (train_head.main, evaluate.main):
-        assert run("", command, told) == 2
-        assert "stages.archive --restore" in capsys.readouterr().err
