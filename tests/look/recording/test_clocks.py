@@ -9,30 +9,12 @@ import numpy as np
 import pytest
 
 from pipeline.base.errors import Issue
-from pipeline.look.recording.clocks import Clock, Gap, find_clock_issues, read_clocks, usual_step
+from pipeline.look.recording.clocks import Clock, Gap, find_clock_issues, usual_step
 from pipeline.look.recording.episode import EpisodeView
 
 
 def gaps(time: np.ndarray) -> tuple[Gap, ...]:
     return Clock("sensor", "stream", time).gaps
-
-
-@pytest.mark.parametrize("format", ["raw", "new", "old", "lerobot"])
-def test_every_clock_of_a_recording(healthy: Path, look: Callable[..., EpisodeView], format: str):
-    view = look(healthy / format)
-    assert view.timeline is not None
-    found = {clock.name: clock for clock in read_clocks(view)}
-    views = {"view View1", "view View2", "view View5"}
-    assert set(found) == views | {"ticks", "VL rows"} | view.streams.keys()
-    assert found["ticks"].kind == "tick" and found["VL rows"].kind == "vl_row"
-    assert found["view View1"].kind == "camera" and found["sensor"].kind == "stream"
-    assert found["ticks"].rate_hz == pytest.approx(10)
-    assert found["VL rows"].rate_hz == pytest.approx(10 / 3)
-    assert found["ticks"].mean_rate_hz == pytest.approx(10)
-    assert found["view View2"].mean_rate_hz <= found["view View2"].rate_hz * 1.01
-    assert found["sensor"].rate_hz == pytest.approx(10 if format == "old" else 650, rel=0.01)
-    # The simulated raw recorder loses five rows of the robot's in every episode.
-    assert len(found["state"].gaps) == (format == "raw")
 
 
 def test_one_lost_entry_is_no_gap_and_two_are() -> None:
