@@ -14,7 +14,7 @@ from gymnasium.utils.env_checker import check_env
 
 from pipeline.simulation.environment import InsertionEnvironment, SimulatedRobot
 from pipeline.simulation.insertion import INSERTED, MAX_TICKS, TICK_S, TIME_IS_UP
-from pipeline.simulation.rendering import VIEWS, photograph, render
+from pipeline.simulation.rendering import VIEWS, render
 from tests.simulation.environment_contract import EnvironmentContract
 
 STILL = np.zeros(7, np.float32)
@@ -77,18 +77,6 @@ def test_frames_are_those_taken_last() -> None:
             assert np.abs(frame.astype(int) - render(view, scene).astype(int)).mean() < 4
         observation, *_, info = environment.step(environment.insertion.expert_action())
     assert min(ages) >= 0 and max(ages) < 1.3 * TICK_S and np.std(ages) > 0.01
-
-
-def test_a_photograph_has_noise_and_is_the_same_again() -> None:
-    environment = InsertionEnvironment(cameras=False)
-    environment.reset(seed=2)
-    for view in VIEWS:
-        first = photograph(view, environment.insertion, 0.05)
-        np.testing.assert_array_equal(first, photograph(view, environment.insertion, 0.05))
-        again = photograph(view, environment.insertion, 0.051)
-        clean = render(view, environment.insertion.scene(0.05))
-        assert not np.array_equal(first, again)
-        assert 1 < np.std(first.astype(int) - clean.astype(int)) < 3
 
 
 def test_what_makes_no_sense_is_refused() -> None:
