@@ -9,12 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import yaml
-
-from pipeline.simulation.insertion_formats import write_raw
-from pipeline.simulation.recorder import simulate_episode
-from stages import extract, train_head
-from stages.command import run
 
 ROOT = Path(__file__).resolve().parents[2]
 Process = subprocess.Popen[str]
@@ -49,37 +43,6 @@ def quick_params(
         }
 
     return document
-
-
-@pytest.fixture(scope="session")
-def trained_once(
-    tmp_path_factory: pytest.TempPathFactory,
-    demo_checkpoint: Path,
-    tiny_head: Callable[..., dict[str, Any]],
-) -> Path:
-    """What `trained` is a copy of."""
-    folder = tmp_path_factory.mktemp("phantom")
-    for seed in (5, 6):
-        write_raw(folder / "raw" / "task", simulate_episode(seed, 1.7e9 + 100 * seed))
-    document = {
-        "data": {"root": str(folder), "sources": [{"name": "raw", "path": "raw"}]},
-        "vlm": {
-            "checkpoint": str(demo_checkpoint),
-            "image_resize_height": 56,
-            "image_resize_width": 84,
-            "dtype": "float32",
-            "pooling": ["mean"],
-        },
-        "extract": {"store": str(folder / "store.zarr")},
-        "train_head": tiny_head(folder),
-        "rollout": {"episodes": 2, "output": str(folder / "rollout")},
-        "serve": {"port": 0, "device": "cpu"},
-    }
-    path = folder / "params.yaml"
-    path.write_text(yaml.safe_dump(document))
-    for stage in (extract, train_head):
-        assert run("", stage.main, ["--params", str(path)]) == 0
-    return path
 
 
 @pytest.fixture(scope="module")
