@@ -11,8 +11,6 @@ from pipeline.base.config import Params
 from pipeline.base.errors import ConfigError
 from pipeline.look.scrubbing import write_episodes
 from pipeline.look.subject import subject_of
-from pipeline.simulation.insertion_formats import write_raw
-from pipeline.simulation.recorder import simulate_episode
 from pipeline.store import FeatureStore
 
 
@@ -40,10 +38,9 @@ def rows_by_place(file: Path) -> dict[str, int]:
 
 
 @pytest.mark.extra
-def test_a_recording_is_there_with_all_that_moves_in_it(tmp_path: Path) -> None:
+def test_a_recording_is_there_with_all_that_moves_in_it(recorded, tmp_path):
     pytest.importorskip("rerun")
-    write_raw(tmp_path / "raw" / "task", simulate_episode(5, 1.7e9))
-    params = params_of(tmp_path / "raw", tmp_path / "out")
+    params = params_of(recorded, tmp_path / "out")
     subject = subject_of(params)
     (recording,) = subject.recordings(None).recordings
     (file,) = write_episodes(subject, params)

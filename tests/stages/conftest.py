@@ -9,6 +9,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import yaml
+
+from stages import train_head
+from stages.command import run
 
 ROOT = Path(__file__).resolve().parents[2]
 Process = subprocess.Popen[str]
@@ -43,6 +47,24 @@ def quick_params(
         }
 
     return document
+
+
+@pytest.fixture(scope="session")
+def trained_tiny(
+    quick_params: Callable[[Path], dict[str, Any]], tmp_path_factory: pytest.TempPathFactory
+) -> Path:
+    """A params.yaml whose head is trained on a tiny store."""
+    folder = tmp_path_factory.mktemp("tiny")
+    judged = {"checkpoint": str(folder / "head"), "output": str(folder / "report")}
+    alone = {"environment": None}  # no page of rollouts, to which the way would differ
+    document = quick_params(folder) | {"evaluate": judged, "rollout": alone}
+    document["export"] = {"output": str(folder / "export")}
+    # The last episode is test, and the tail of the others val.
+    document["train_head"]["split"] = {"groups": {"rest": ["*_00[0-4]"]}}
+    path = folder / "params.yaml"
+    path.write_text(yaml.safe_dump(document))
+    assert run("", train_head.main, ["--params", str(path)]) == 0
+    return path
 
 
 @pytest.fixture(scope="module")
