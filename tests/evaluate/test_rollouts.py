@@ -85,18 +85,6 @@ def test_every_controller_meets_the_same_episodes(rollouts: Rollouts) -> None:
     assert head == f"controller,{columns}" and len(lines) == 3 * 3
 
 
-@pytest.mark.parametrize(
-    ("model_type", "chunking"),
-    [("regression", "none"), ("diffusion", "temporal"), ("flow_matching", "rtc")],
-)
-def test_same_seeds_same_figures(model_type: str, chunking: str) -> None:
-    settings = {"chunking": chunking, "execute": 2, "ablations": (), "episodes": 2}
-    first, again = (rolled(made(model_type), **settings) for _ in range(2))
-    assert figures(first) == figures(again)
-    if chunking == "none":
-        assert figures(first)[1] != figures(rolled(made(model_type), **settings, seed=500))[1]
-
-
 def test_an_episode_is_the_same_alone_as_among_others() -> None:
     """So that one that failed can be looked at again by its seed."""
     settings = {"chunking": "rtc", "execute": 2, "ablations": ()}

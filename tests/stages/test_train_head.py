@@ -2,7 +2,6 @@
 
 import json
 import os
-import shutil
 import signal
 import subprocess
 import sys
@@ -157,34 +156,6 @@ def test_two_runs_do_not_write_their_curves_into_one_folder(write_params, tmp_pa
     assert run("", train_head.main, arguments) == 0, "the same run goes on"
 
 
-@pytest.mark.slow  # as tests/faults/test_kills.py kills it, without the stage's process
-def test_killed_in_mid_run_it_ends_where_an_undisturbed_run_ends(
-    started_until, write_params, tmp_path, capsys
-):
-    undisturbed, killed = write_params("undisturbed"), write_params("killed")
-    process = started_until(HELD.format(step=18), killed, "holding")
-    try:
-        assert run("", train_head.main, ["--params", str(killed)]) == 2
-        assert "being built by process" in capsys.readouterr().err
-    finally:
-        process.kill()
-        process.communicate()
-    part = tmp_path / "killed/head.part"
-    assert (part / "last/policy.json").exists()
-    assert not (tmp_path / "killed/head").exists()
-    for params in (undisturbed, killed):
-        assert run("", train_head.main, ["--params", str(params)]) == 0
-    out = capsys.readouterr().out
-    assert "resuming the run in" in out
-    assert "steps 16 to 30" in out
-    for name in ("best", "last"):
-        files = [
-            tmp_path / run / "head" / name / "policy.safetensors"
-            for run in ("undisturbed", "killed")
-        ]
-        assert files[0].read_bytes() == files[1].read_bytes()
-
-
 @pytest.mark.slow
 def test_a_sigterm_leaves_the_step_it_came_in(started_until, write_params, tmp_path):
     params = write_params(checkpoint_every=1000)
@@ -228,16 +199,3 @@ def test_a_flipped_bit_is_refused_where_it_would_be_learnt_from(
     # A finished run reads no number of the store, and is the same run with the check as without.
     assert run("", train_head.main, arguments) == 0
     assert "nothing to do" in capsys.readouterr().out
-
-
-def test_features_of_another_store_are_refused_although_they_give_their_checksums(
-    write_params, tiny_store, tmp_path, capsys
-):
-    arguments = ["--params", str(write_params(max_steps=3))]
-    store, other = tmp_path / "params.zarr", tiny_store(tmp_path, name="other", seed=9)
-    shutil.copytree(other / "vl/features/c", store / "vl/features/c", dirs_exist_ok=True)
-    shutil.copytree(other / "vl/checksum/c", store / "vl/checksum/c", dirs_exist_ok=True)
-    assert run("", train_head.main, arguments) == 2
-    error = capsys.readouterr().err
-    assert f"{store}/vl/features/c/0/0/0: " in error
-    assert "stages.verify --repair" in error
