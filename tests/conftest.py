@@ -15,7 +15,8 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import closing
+from contextlib import closing, redirect_stdout
+from io import StringIO
 from multiprocessing import forkserver, get_context
 from multiprocessing.context import ForkServerContext
 from pathlib import Path
@@ -25,6 +26,7 @@ from typing import Any, get_args
 import numpy as np
 import pytest
 import torch
+import yaml
 from beartype import beartype
 from hypothesis import HealthCheck, settings
 from jaxtyping import AbstractArray, install_import_hook
@@ -74,6 +76,7 @@ install_import_hook(
     "shape_checks.check_shapes",
 )
 
+from pipeline.base.config import load_params
 from pipeline.simulation.insertion_formats import write_raw
 from pipeline.simulation.recorder import simulate_episode
 from pipeline.store import SCHEMA, FeatureStore, Sizes, StoreBuild, arrays, schema
@@ -422,6 +425,41 @@ def demo_checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("checkpoint") / "demo_vlm"
     write_demo_checkpoint(folder)
     return folder
+
+
+@pytest.fixture(scope="session")
+def trained_once(
+    tmp_path_factory: pytest.TempPathFactory,
+    demo_checkpoint: Path,
+    tiny_head: Callable[..., dict[str, Any]],
+) -> Path:
+    """A params.yaml whose head is trained on two recordings of the phantom; beside it what was
+    made, not to be written to."""
+    from stages import extract, train_head
+
+    folder = tmp_path_factory.mktemp("phantom")
+    for seed in (5, 6):
+        write_raw(folder / "raw" / "task", simulate_episode(seed, 1.7e9 + 100 * seed))
+    document = {
+        "data": {"root": str(folder), "sources": [{"name": "raw", "path": "raw"}]},
+        "vlm": {
+            "checkpoint": str(demo_checkpoint),
+            "image_resize_height": 56,
+            "image_resize_width": 84,
+            "dtype": "float32",
+            "pooling": ["mean", "grid"],
+        },
+        "extract": {"store": str(folder / "store.zarr")},
+        "train_head": tiny_head(folder),
+        "rollout": {"episodes": 2, "output": str(folder / "rollout")},
+        "serve": {"port": 0, "device": "cpu"},
+    }
+    path = folder / "params.yaml"
+    path.write_text(yaml.safe_dump(document))
+    for stage in (extract, train_head):
+        with redirect_stdout(StringIO()):
+            stage.main(load_params(path))
+    return path
 
 
 @pytest.fixture(scope="session")

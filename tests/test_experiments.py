@@ -77,9 +77,7 @@ def run(monkeypatch: pytest.MonkeyPatch, capsys: Any, *arguments: str) -> dict[s
     return json.loads(capsys.readouterr().out.splitlines()[-1])
 
 
-def test_a_finished_table_is_told_from_its_files(
-    done: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any
-) -> None:
+def test_a_finished_table_is_told_from_its_files(done, monkeypatch, capsys):
     rows = run(monkeypatch, capsys, "experts", "--out", str(done), "--episodes", "50")["rows"]
     assert [label.partition(" | ")[0] for label in rows] == list(TABLES["experts"].recipes)
     row = rows["diffusion | on time"]
@@ -89,41 +87,31 @@ def test_a_finished_table_is_told_from_its_files(
     assert low < rate < high and high - low == pytest.approx(0.16, abs=0.02)  # of 100, at 0.8
 
 
-def test_other_params_want_another_folder(
-    done: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any
-) -> None:
+def test_other_params_want_another_folder(done, monkeypatch, capsys):
     run(monkeypatch, capsys, "experts", "--out", str(done), "--episodes", "50")
     (done / "params.yaml").write_text("data: {}")
     with pytest.raises(SystemExit, match="Name another folder"):
         run(monkeypatch, capsys, "experts", "--out", str(done), "--episodes", "50")
 
 
-def test_more_episodes_are_rolled_out_again(
-    done: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any
-) -> None:
+def test_more_episodes_are_rolled_out_again(done, monkeypatch, capsys):
     with pytest.raises(AssertionError, match="all is done already"):
         run(monkeypatch, capsys, "experts", "--out", str(done), "--episodes", "60")
 
 
-def test_worth_ranks_success_against_errors(
-    done: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any
-) -> None:
+def test_worth_ranks_success_against_errors(done, monkeypatch, capsys):
     told = run(monkeypatch, capsys, "worth", "--out", str(done))
     assert (done / "worth.png").read_bytes().startswith(b"\x89PNG")
     assert len(told["policies"]) == 12
     assert all(correlation < -0.8 for correlation in told["rank_correlation"].values())
 
 
-def test_worth_of_too_few_policies_says_what_to_do(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any
-) -> None:
+def test_worth_of_too_few_policies_says_what_to_do(tmp_path, monkeypatch, capsys):
     with pytest.raises(SystemExit, match="make a table"):
         run(monkeypatch, capsys, "worth", "--out", str(tmp_path))
 
 
-def test_staleness_draws_success_against_latency(
-    done: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any
-) -> None:
+def test_staleness_draws_success_against_latency(done, monkeypatch, capsys):
     late = done / "as-it-is-0" / "300 ms"
     late.mkdir()
     (late / "episodes.csv").write_text("success,lateral_mm\nTrue,0.1\nFalse,3")
@@ -133,24 +121,18 @@ def test_staleness_draws_success_against_latency(
     assert told["anchored (default)"]["300"][0] == 0.5
 
 
-def test_staleness_of_nothing_says_what_to_do(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any
-) -> None:
+def test_staleness_of_nothing_says_what_to_do(tmp_path, monkeypatch, capsys):
     with pytest.raises(SystemExit, match="Make the table `latency`"):
         run(monkeypatch, capsys, "staleness", "--out", str(tmp_path))
 
 
-def test_a_rollout_that_was_cut_off_is_done_again(
-    done: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any
-) -> None:
+def test_a_rollout_that_was_cut_off_is_done_again(done, monkeypatch, capsys):
     (done / "gated-1" / "on time" / "beside.csv").unlink()
     with pytest.raises(AssertionError, match="all is done already"):
         run(monkeypatch, capsys, "experts", "--out", str(done), "--episodes", "50")
 
 
-def test_after_a_failure_nothing_more_begins(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any
-) -> None:
+def test_after_a_failure_nothing_more_begins(tmp_path, monkeypatch, capsys):
     begun: list[str] = []
 
     def fail(wanted: Any, name: str, seed: int) -> None:

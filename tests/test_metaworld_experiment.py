@@ -67,9 +67,7 @@ def test_a_set_is_what_the_expert_did_and_is_recorded_once(tmp_path: Path) -> No
 
 @needs_meta_world
 @pytest.mark.extra
-def test_the_protocol_goes_from_demonstrations_to_a_table(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_protocol_goes_from_demonstrations_to_a_table(tmp_path, monkeypatch, capsys):
     """Tiny: three demonstrations of one task, six steps, rollouts of one episode."""
     from experiments.metaworld import protocol
     from experiments.metaworld.table import judged, write_tables

@@ -1,9 +1,7 @@
 """Whatever comes in is bounded, and refused with file, place, expected, found and mend."""
 
 import os
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -35,9 +33,7 @@ class Robot(Document):
         (b" " * 101, "expected at most 100 bytes, found 101"),
     ],
 )
-def test_a_document_is_the_model_or_one_message(
-    tmp_path: Path, content: bytes, message: str
-) -> None:
+def test_a_document_is_the_model_or_one_message(tmp_path, content, message):
     path = tmp_path / "robot.json"
     path.write_bytes(content)
     most = 100 if content.isspace() else 2**25
@@ -65,9 +61,7 @@ def test_unknown_keys_are_left_alone_and_types_are_not_guessed() -> None:
         (lambda path: path.symlink_to(path), "cannot be read: Too many levels of symbolic links"),
     ],
 )
-def test_only_regular_files_are_opened(
-    tmp_path: Path, make: Callable[[Path], Any], message: str
-) -> None:
+def test_only_regular_files_are_opened(tmp_path, make, message):
     make(tmp_path / "f")
     with pytest.raises(RecordingError, match=message):
         BORDER.read_bytes(tmp_path / "f")

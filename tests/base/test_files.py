@@ -36,9 +36,7 @@ def put(folder: Path, text: str) -> None:
 
 
 @pytest.mark.parametrize("survived", [0, 4, 5, 6])
-def test_a_kill_between_any_two_steps_leaves_the_old_or_the_new(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, survived: int
-) -> None:
+def test_a_kill_between_any_two_steps_leaves_the_old_or_the_new(tmp_path, monkeypatch, survived):
     folder = tmp_path / "last"
     put(folder, "old")
     steps = 0
@@ -79,9 +77,7 @@ def test_a_link_of_the_user_beside_it_stays(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("linked", [False, True])
-def test_a_kill_at_any_step_of_a_replacement_is_undone_or_completed(
-    tmp_path: Path, linked: bool
-) -> None:
+def test_a_kill_at_any_step_of_a_replacement_is_undone_or_completed(tmp_path, linked):
     """Kill before the n-th change of the folder, for every n, until none is left."""
     for kill_at in range(40):
         here = tmp_path / str(kill_at)
@@ -156,9 +152,7 @@ def test_a_damaged_document_is_named(tmp_path: Path, content: str) -> None:
         read_document(path, dict)[1]
 
 
-def test_only_a_document_with_its_digest_may_be_as_long_as_a_long_run(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_only_a_document_with_its_digest_may_be_as_long_as_a_long_run(tmp_path, monkeypatch):
     for limit in ("MOST_WEIGHT", "_MOST_WEIGHT"):  # so that the document is a hundredth as long
         monkeypatch.setattr(files, limit, getattr(files, limit) // 100)
     path = tmp_path / "d.json"

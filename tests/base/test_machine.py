@@ -68,9 +68,7 @@ def test_the_least_limit_of_the_groups_above_counts(machine, limited):
         ("bfloat16", CPU, False, True),
     ],
 )
-def test_when_the_forward_pass_runs_in_bfloat16(
-    monkeypatch: pytest.MonkeyPatch, amp, device: torch.device, supported: bool, expected: bool
-) -> None:
+def test_when_the_forward_pass_runs_in_bfloat16(monkeypatch, amp, device, supported, expected):
     monkeypatch.setattr(torch.cuda, "is_bf16_supported", lambda including_emulation: supported)
     assert use_bfloat16(amp, device) is expected
 

@@ -21,9 +21,7 @@ METADATA = {
 
 
 @pytest.mark.parametrize(("safe_stop", "stopped_at"), [(False, 10.2), (True, 45.0)])
-def test_a_tick_that_is_neither_run_nor_left_out_is_not_accounted_for(
-    safe_stop: bool, stopped_at: float
-) -> None:
+def test_a_tick_that_is_neither_run_nor_left_out_is_not_accounted_for(safe_stop, stopped_at):
     """Ticks 0, 1, 2, 5, 6, 9, and a last one where it is stopped safely, for 35 ticks."""
     now = 0.0
     with closing(CountedRobot(hz=100.0, clock=lambda: now)) as robot:

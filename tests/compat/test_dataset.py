@@ -2,7 +2,6 @@
 
 import json
 import pickle
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -79,9 +78,7 @@ def equal(a: Any, b: Any) -> bool:
 
 
 class TestItems:
-    def test_an_item_is_what_the_timeline_says(
-        self, recordings: Path, new: UnifiedVLADataset
-    ) -> None:
+    def test_an_item_is_what_the_timeline_says(self, recordings, new):
         source = Source(name="new", path=str(recordings / "new"))
         recording = open_recordings([source]).recordings[1]
         state, sensor = recording.state(), recording.sensor()
@@ -109,9 +106,7 @@ class TestItems:
                 (frame,) = camera.read([index])
                 assert np.array_equal(item["images"][view], frame)
 
-    def test_frames_and_features_come_with_the_same_streams(
-        self, live: UnifiedVLADataset, cached: UnifiedVLADataset
-    ) -> None:
+    def test_frames_and_features_come_with_the_same_streams(self, live, cached):
         assert len(live) == len(cached) == len(live.ticks)
         items = list(range(0, len(live), 5))
         a, b = live.__getitems__(items), cached.__getitems__(items)
@@ -124,9 +119,7 @@ class TestItems:
         assert b.key is not None
         assert np.array_equal(b.key.numpy(), cached.store.array("vl/key")[rows])
 
-    def test_samples_make_the_batch_that_is_read_in_one_go(
-        self, live: UnifiedVLADataset, cached: UnifiedVLADataset
-    ) -> None:
+    def test_samples_make_the_batch_that_is_read_in_one_go(self, live, cached):
         for data in (live, cached):
             items = [0, 1, 2, len(data) - 1, 40]
             batch = unified_collate_fn(data.__getitems__(items))
@@ -139,9 +132,7 @@ class TestItems:
         with pytest.raises(StoreMismatch, match="1 of its 2 samples"):
             unified_collate_fn([live[0], cached[0]])
 
-    def test_a_row_is_decoded_once_for_the_ticks_that_share_it(
-        self, live: UnifiedVLADataset
-    ) -> None:
+    def test_a_row_is_decoded_once_for_the_ticks_that_share_it(self, live):
         batch = live.__getitems__([0, 1, 2, 3])
         assert batch.images is not None
         assert batch.vl_row.tolist() == [0, 0, 0, 1]
@@ -151,9 +142,7 @@ class TestItems:
         assert moved.sensor.is_meta and moved.tick.is_meta
         assert moved.images is batch.images and moved.instruction == batch.instruction
 
-    def test_a_missing_view_is_absent_and_a_missing_stream_counts_nothing(
-        self, copied: Callable[[str], Path]
-    ) -> None:
+    def test_a_missing_view_is_absent_and_a_missing_stream_counts_nothing(self, copied):
         folder = copied("new")
         first = sorted((folder / "Red_point").iterdir())[0]
         for image in (first / "images" / "View2").iterdir():
@@ -181,8 +170,8 @@ class TestItems:
 
 class TestOneActionRotation:
     def test_rotation_vectors_where_all_have_poses_else_euler_deltas(
-        self, copied: Callable[[str], Path], recordings: Path, live: UnifiedVLADataset
-    ) -> None:
+        self, copied, recordings, live
+    ):
         assert live.store.streams["action"]["names"][3:6] == ["rx", "ry", "rz"]
         old = copied("old")
         for states in old.glob("**/robot_states.npz"):
@@ -205,9 +194,7 @@ class TestOneActionRotation:
 
 
 class TestStore:
-    def test_an_alias_takes_the_episodes_of_its_format(
-        self, extracted: FeatureStore, recordings: Path
-    ) -> None:
+    def test_an_alias_takes_the_episodes_of_its_format(self, extracted, recordings):
         old = AsyncInsertionMeca500DatasetWithSensor(store=extracted)
         new = NewAsyncInsertionDataset(store=extracted.path)
         assert {episode.format for episode in old.episodes} == {"old"}
@@ -219,9 +206,7 @@ class TestStore:
         assert np.array_equal(again.ticks, new.ticks)
         assert [episode.source for episode in again.episodes] == ["new", "new"]
 
-    def test_recordings_that_it_lacks_are_named(
-        self, copied: Callable[[str], Path], extracted: FeatureStore
-    ) -> None:
+    def test_recordings_that_it_lacks_are_named(self, copied, extracted):
         folder = copied("new")
         episode = sorted((folder / "Red_point").iterdir())[0]
         episode.rename(episode.with_name("episode_20990101_000000"))
@@ -256,9 +241,7 @@ class TestErrors:
         with pytest.raises(ConfigError, match=r"action_rotation: .*rotvec.*'newest'"):
             UnifiedVLADataset(recordings / "new", action_rotation=wrong)
 
-    def test_two_embodiments_are_refused_naming_both(
-        self, recordings: Path, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
+    def test_two_embodiments_are_refused_naming_both(self, recordings, monkeypatch):
         """Of the same channels, but what they mean differs."""
 
         def other(one: WindowedRecording) -> RecordedAction | None:
@@ -283,7 +266,7 @@ class TestErrors:
         with pytest.raises(StoreIncomplete, match=r"nowhere\.zarr"):
             UnifiedVLADataset(store=tmp_path / "nowhere.zarr")
 
-    def test_every_broken_episode_is_named(self, copied: Callable[[str], Path]) -> None:
+    def test_every_broken_episode_is_named(self, copied) -> None:
         folder = copied("new")
         for metadata in folder.glob("**/metadata.json"):
             metadata.write_text("{")
@@ -294,9 +277,7 @@ class TestErrors:
 
 
 class TestSplit:
-    def test_whole_episodes_on_either_side_and_the_store_stays(
-        self, cached: UnifiedVLADataset
-    ) -> None:
+    def test_whole_episodes_on_either_side_and_the_store_stays(self, cached):
         keys = cached.store.array("vl/key")
         before = keys.copy()
         train, held_out = cached.split(0.3)
@@ -308,8 +289,8 @@ class TestSplit:
         assert len(next(iter(loader))) == min(50, len(held_out))
 
     def test_the_same_with_frames_as_with_features_under_the_names_of_the_store(
-        self, recordings: Path, extracted: FeatureStore
-    ) -> None:
+        self, recordings, extracted
+    ):
         named = [
             Source(name=name, path=str(recordings / folder))
             for name, folder in (("first", "old"), ("second", "new"))
@@ -335,9 +316,7 @@ class TestWorkers:
     @pytest.mark.parametrize(
         ("start", "workers"), [("fork", 2), pytest.param("spawn", 1, marks=pytest.mark.slow)]
     )
-    def test_batches_are_those_of_this_process(
-        self, new: UnifiedVLADataset, start: str, workers: int
-    ) -> None:
+    def test_batches_are_those_of_this_process(self, new, start, workers):
         loader = DataLoader(
             new,
             batch_sampler=[[0, 1, 5], [70, 40], [3]],
@@ -349,8 +328,8 @@ class TestWorkers:
             assert equal(batch, new.__getitems__(items))
 
     def test_recordings_that_are_open_already_are_the_same_data(
-        self, recordings: Path, extracted: FeatureStore, live, cached
-    ) -> None:
+        self, recordings, extracted, live, cached
+    ):
         opened = open_recordings(sources(recordings)).recordings
         for ours, theirs in (
             (UnifiedVLADataset(recordings=opened), live),
@@ -359,9 +338,7 @@ class TestWorkers:
             assert len(ours) == len(theirs) and equal(ours[3], theirs[3])
             assert equal(pickle.loads(pickle.dumps(ours))[3], theirs[3])
 
-    def test_a_pickle_opens_the_data_again(
-        self, live: UnifiedVLADataset, cached: UnifiedVLADataset
-    ) -> None:
+    def test_a_pickle_opens_the_data_again(self, live, cached):
         for data in (live, cached):
             sent = pickle.dumps(data)
             assert len(sent) < 4096
@@ -373,8 +350,8 @@ class TestWorkers:
 
 class TestModels:
     def test_the_unified_model_says_the_same_of_frames_and_of_features(
-        self, live: UnifiedVLADataset, cached: UnifiedVLADataset, demo_checkpoint: Path
-    ) -> None:
+        self, live, cached, demo_checkpoint
+    ):
         torch.manual_seed(0)
         model = QwenVLAUnified(
             "regression",

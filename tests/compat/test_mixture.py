@@ -114,9 +114,7 @@ class TestLoader:
             drawn = [formats[episode] for episode in batch.episode.tolist()]
             assert (drawn.count("old"), drawn.count("new")) == (3, 9)
 
-    def test_gives_the_same_ticks_with_features_and_in_workers(
-        self, recordings: Path, extracted: FeatureStore, loader: Any
-    ) -> None:
+    def test_gives_the_same_ticks_with_features_and_in_workers(self, recordings, extracted, loader):
         cached = create_weighted_async_dataloader(
             recordings / "old", recordings / "new", batch_size=12, num_workers=1, store=extracted
         )

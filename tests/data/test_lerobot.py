@@ -125,27 +125,6 @@ def test_a_clock_of_which_one_time_is_off_stays_as_stored(spoilt):
 
 
 @pytest.mark.parametrize(
-    ("fps", "action_hz", "dtype"), [(30, 10, "float32"), (50, 10, "float32"), (15, 5, "float64")]
-)
-def test_a_set_resampled_by_a_whole_factor_gives_the_exact_rows(
-    tmp_path, write, fps, action_hz, dtype
-):
-    rows, reuse, factor = 92, 3, fps // action_hz
-    times = (np.arange(rows) / fps).astype(dtype)
-    root = write.lerobot(tmp_path / "set", image=True, lengths=(rows,), timestamp=times)
-    write.edit_json(root / "meta/info.json", fps=fps)
-    (recording,) = open_all(root)
-    state = recording.state()
-    line = build_timeline(recording, action_hz, reuse, "euler_delta", state)
-    exact = np.arange(0, rows, factor)
-    np.testing.assert_array_equal(line.action, recording.action().values[exact])
-    np.testing.assert_array_equal(line.state_end, exact + 1)
-    np.testing.assert_array_equal(line.frames["top"], exact[::reuse])
-    frames = recording.cameras()["top"].read(line.frames["top"].tolist())
-    assert shades(frames) == [write.shade_of(row) for row in exact[::reuse]]
-
-
-@pytest.mark.parametrize(
     ("times", "message"),
     [
         (np.float32([0, 1, 2, 3, 2.5, 5, 6]), r"goes backwards at row 4"),
@@ -599,15 +578,6 @@ def test_row_counts_that_disagree_with_meta_are_named(root, write):
         open_all(root)[0].state()
 
 
-@pytest.mark.parametrize("version", ["v2.1", "v3.0"])
-def test_frame_counts_that_disagree_are_found_by_check(seven, write, version):
-    root = seven(version)
-    (path,) = root.rglob("*.mp4")
-    write.video(path, [50] * 6)
-    with refused(match=r"\.mp4: 6 frames of view 'top' but 7 rows"):
-        open_all(root)[0].cameras()["top"].check([0])
-
-
 def test_timestamps_of_meta_that_disagree_with_the_rows_are_found_by_check(tmp_path, write):
     root = write.lerobot(tmp_path / "set", "v3.0")
     edit_v3(root, **{f"videos/{VIEW_KEY}/to_timestamp": [0.6, 1.2, 2.1]})
@@ -834,15 +804,6 @@ def test_what_is_no_file_is_named(seven, file, version, make):
     kind = "a folder" if make is Path.mkdir else "a pipe, socket or device"
     with refused(match=rf"{file}: expected a file, found {kind}"):
         open_all(root)
-
-
-def test_videos_of_one_path_are_refused(tmp_path, write):
-    root = write.lerobot(tmp_path / "set")
-    path = f"videos/chunk-000/{VIEW_KEY}/episode_000000.mp4"
-    write.edit_json(root / "meta/info.json", video_path=path)
-    for recording in open_all(root):
-        with refused(match=r"000000\.mp4: meta/ gives frames of .* to episode_00000\d and to epis"):
-            recording.cameras()
 
 
 def test_episodes_that_are_written_with_films_are_read_again(tmp_path):

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipeline.base.errors import RecordingError
@@ -368,6 +368,7 @@ PLAIN = st.recursive(
 )
 
 
+@settings(max_examples=40)  # of up to twenty leaves each
 @given(PLAIN, st.integers(0, 5))
 def test_it_gives_what_pickle_gives(content, protocol):
     written = pickle.dumps(content, protocol)

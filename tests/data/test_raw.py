@@ -57,6 +57,11 @@ def spoil_csv(folder: Path, edit) -> None:
     path.write_text("\n".join(edit(lines)))
 
 
+def in_whole_seconds(line: str) -> str:
+    received, time, *rest = line.split(",")
+    return ",".join([received, str(round(float(time))), *rest])
+
+
 @pytest.mark.parametrize(
     ("edit", "message"),
     [
@@ -66,6 +71,10 @@ def spoil_csv(folder: Path, edit) -> None:
         (lambda ls: [*ls[:-1], ls[-1][:60]], "line 51: expected 15 cells.*found 5.*cut off"),
         (lambda ls: [*ls[:4], "0," + ls[4], *ls[5:]], "line 5: expected 15 .*found 16.*shifted"),
         (lambda ls: [ls[0], ls[2], ls[1], *ls[3:]], "goes backwards at row 1"),
+        (
+            lambda ls: [ls[0], *map(in_whole_seconds, ls[1:])],
+            "float64 near .* steps of 1 s, too coarse",
+        ),
         (lambda ls: ls[:1], "empty"),
         (lambda ls: [], "missing column"),
     ],

@@ -116,9 +116,7 @@ def times(study: AblationStudy, stream: str, how: str) -> float:
     return ratio.value
 
 
-def test_a_stream_that_decides_the_action_is_missed_and_others_are_not(
-    study: AblationStudy,
-) -> None:
+def test_a_stream_that_decides_the_action_is_missed_and_others_are_not(study):
     ratio = rivalry(study.intact).ratio
     assert ratio is not None and ratio < 0.5
     for ablated in study.ablated:
@@ -139,9 +137,7 @@ def test_the_ways_to_spoil_are_those_that_mean_something(study: AblationStudy) -
     assert all(one.comparison.ticks == study.intact.ticks for one in study.ablated)
 
 
-def test_the_figures_are_the_same_in_table_and_files(
-    study: AblationStudy, trained_store: FeatureStore, tmp_path: Path
-) -> None:
+def test_the_figures_are_the_same_in_table_and_files(study, trained_store, tmp_path):
     multiple = times(study, "sensor", "zeroed")
     ticks = np.arange(4)
     predictions = Predictions(ticks, ticks * 0, *[np.zeros((4, 1, 5), np.float32)] * 2, ticks > 0)
@@ -164,9 +160,7 @@ def test_the_figures_are_the_same_in_table_and_files(
     assert ablation_text(study).splitlines()[-len(study.notes) :] == list(study.notes)
 
 
-def test_missing_is_judged_where_training_dropped_the_stream(
-    tiny_store: Make, tmp_path: Path
-) -> None:
+def test_missing_is_judged_where_training_dropped_the_stream(tiny_store, tmp_path):
     store = FeatureStore.open(tiny_store(tmp_path))
     found = studied(store, drop_sensor=0.2, robot_state_enabled=False)
     assert found is not None
@@ -178,9 +172,7 @@ def test_missing_is_judged_where_training_dropped_the_stream(
     assert [note.split(":")[0] for note in others] == ["features missing", "features delayed"]
 
 
-def test_one_held_out_episode_has_nobody_to_be_shuffled_with(
-    tiny_store: Make, tmp_path: Path
-) -> None:
+def test_one_held_out_episode_has_nobody_to_be_shuffled_with(tiny_store, tmp_path):
     store = FeatureStore.open(tiny_store(tmp_path, reuse=1))
     found = studied(store, np.arange(30, 60))
     assert found is not None
@@ -203,9 +195,7 @@ def test_donors_are_of_other_episodes(store: FeatureStore) -> None:
     assert donors_of(store, np.arange(30), "features") is None
 
 
-def test_an_episode_without_the_stream_gives_and_takes_nothing(
-    store: FeatureStore, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_episode_without_the_stream_gives_and_takes_nothing(store, monkeypatch):
     ticks = np.arange(90)
     array = store.array
 
@@ -223,9 +213,7 @@ def test_an_episode_without_the_stream_gives_and_takes_nothing(
 
 
 @pytest.mark.parametrize(("lacking", "judged"), [([1], 54), ([0, 1, 2], 0)])
-def test_a_stream_is_ablated_where_the_episodes_have_it(
-    tiny_store: Make, tmp_path: Path, lacking: list[int], judged: int
-) -> None:
+def test_a_stream_is_ablated_where_the_episodes_have_it(tiny_store, tmp_path, lacking, judged):
     """Of three episodes with 27 ticks each, some lack the sensor."""
     store = FeatureStore.open(tiny_store(tmp_path))
     found = studied(store, np.arange(90), lacking=lacking)
@@ -263,9 +251,7 @@ def test_features_go_back_whole_rows(tiny_store: Make, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("ticks", "how"), [(2, "delayed 330 ms"), (1, "delayed inf ms")])
-def test_the_time_between_episodes_is_no_step_of_ticks(
-    tiny_store: Make, tmp_path: Path, ticks: int, how: str
-) -> None:
+def test_the_time_between_episodes_is_no_step_of_ticks(tiny_store, tmp_path, ticks, how):
     """Where recorded rows are the ticks, their median step says how long a delay is."""
     store = FeatureStore.open(tiny_store(tmp_path, ticks=ticks))
     store.attrs["action_hz"] = None

@@ -12,7 +12,6 @@ from pipeline.evaluate.baselines import BASELINES, METHODS, Baselines, recorded_
 from pipeline.policy.normalization import ChannelStatistics
 from pipeline.store import FeatureStore
 
-Patch = pytest.MonkeyPatch
 Make = Callable[..., Any]
 
 TRAIN = np.arange(90, 180)
@@ -39,9 +38,7 @@ def test_each_rule_by_hand(store: FeatureStore) -> None:
     assert found["linear_fit"].shape == found["nearest_neighbour"].shape == (5, 4, 5)
 
 
-def test_absolute_actions_are_not_repeated_from_nothing(
-    store: FeatureStore, monkeypatch: Patch
-) -> None:
+def test_absolute_actions_are_not_repeated_from_nothing(store, monkeypatch):
     absolute = store.streams | {"action": store.streams["action"] | ABSOLUTE}
     monkeypatch.setattr(FeatureStore, "streams", absolute)
     action = store.array("tick/action")
@@ -82,9 +79,7 @@ def test_a_joint_that_stands_elsewhere_does_not_upset_the_linear_fit(
 
 
 @pytest.mark.parametrize("width", [3, 256])
-def test_the_nearest_neighbour_of_a_training_tick_is_itself(
-    store: FeatureStore, monkeypatch: Patch, width: int
-) -> None:
+def test_the_nearest_neighbour_of_a_training_tick_is_itself(store, monkeypatch, width):
     monkeypatch.setattr(rules, "_WIDTH", width)
     monkeypatch.setattr(rules, "_ROWS", 7)
     found = Baselines(store, TRAIN, 4, statistics(store)).act(TRAIN)["nearest_neighbour"]
@@ -106,9 +101,7 @@ def test_state_and_features_both_decide_who_is_near(tiny_store: Make, tmp_path: 
     assert by_features is not None and row[by_features] == row[near]
 
 
-def test_an_angle_is_near_where_it_is_written_a_turn_further(
-    tiny_store: Make, tmp_path: Path, monkeypatch: Patch
-) -> None:
+def test_an_angle_is_near_where_it_is_written_a_turn_further(tiny_store, tmp_path, monkeypatch):
     store = FeatureStore.open(tiny_store(tmp_path))
     pose = {"names": ["pose_a", "pose_b", "pose_r", "joint_1"], "units": ["deg"] * 4}
     monkeypatch.setattr(FeatureStore, "streams", store.streams | {"state": pose})
@@ -121,9 +114,7 @@ def test_an_angle_is_near_where_it_is_written_a_turn_further(
 
 
 @pytest.mark.parametrize("state_dim", [0, 4])
-def test_a_stream_that_is_missing_leaves_the_other_or_the_median(
-    tiny_store: Make, tmp_path: Path, state_dim: int
-) -> None:
+def test_a_stream_that_is_missing_leaves_the_other_or_the_median(tiny_store, tmp_path, state_dim):
     store = FeatureStore.open(tiny_store(tmp_path, state_dim=state_dim))
     found = Baselines(store, TRAIN, 2, None).act(TRAIN)
     if state_dim:

@@ -99,8 +99,6 @@ def test_absolute_actions_rest_where_they_do_not_change(pressed: FeatureStore) -
     assert found[12] == "contact" and found[23] == "hold"
 
 
-def test_without_a_force_there_are_no_phases(
-    store: FeatureStore, tiny_store: Callable[..., Path], tmp_path: Path
-) -> None:
+def test_without_a_force_there_are_no_phases(store, tiny_store, tmp_path):
     without = FeatureStore.open(tiny_store(tmp_path, sensor_channels=0))
     assert set(phases_of(store, TICKS)) == set(phases_of(without, TICKS)) == {""}

@@ -1,8 +1,6 @@
 """What is judged of a policy that samples, and what the feed changes of what it sees."""
 
-from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -72,9 +70,7 @@ def test_the_noise_is_of_the_batch_so_that_its_size_decides_too(store: FeatureSt
     assert not np.array_equal(at_once.predicted, run(Noisy(), store, 4).predicted)
 
 
-def test_no_more_chunks_at_once_than_memory_is_promised(
-    store: FeatureStore, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_no_more_chunks_at_once_than_memory_is_promised(store, monkeypatch):
     monkeypatch.setattr(predictions, "_CHUNKS_AT_ONCE", 16)
     policy = Noisy()
     found = run(policy, store, 5)
@@ -124,9 +120,7 @@ def test_predictions_belong_to_their_ticks(store: FeatureStore) -> None:
 
 
 @pytest.mark.parametrize("what", ["recorded action", "action of the policy"])
-def test_a_number_that_is_none_is_named_by_episode_tick_and_time(
-    tiny_store: Callable[..., Path], tmp_path: Path, what: str
-) -> None:
+def test_a_number_that_is_none_is_named_by_episode_tick_and_time(tiny_store, tmp_path, what):
     store = FeatureStore.open(tiny_store(tmp_path))
     if what == "recorded action":
         store.array("tick/action")[37, 3] = np.nan

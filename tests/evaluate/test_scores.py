@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -57,9 +56,7 @@ def test_errors_worked_out_by_hand() -> None:
     assert rivalry(found).ratio == pytest.approx(1.75 / ((13 / 2 + 13 / 10) / 2))
 
 
-def test_a_horizon_no_episode_reaches_has_no_error_and_counts_nowhere(
-    recorded: Recorded, compared: Compared
-) -> None:
+def test_a_horizon_no_episode_reaches_has_no_error_and_counts_nowhere(recorded, compared):
     score = compared(recorded(np.array([29, 59]), error=1.0)).scores["policy"]
     assert score.mae == pytest.approx(np.ones(5))
     assert np.isnan(score.mae_horizon[1:]).all()
@@ -85,9 +82,7 @@ def test_what_lies_beyond_an_episode_changes_no_score(seed: int, ticks: int, hor
         assert np.array_equal(getattr(scores[0], name), getattr(scores[1], name), equal_nan=True)
 
 
-def test_a_group_that_never_varies_is_not_compared_and_weighs_nothing(
-    recorded: Recorded, compared: Compared
-) -> None:
+def test_a_group_that_never_varies_is_not_compared_and_weighs_nothing(recorded, compared):
     error = np.array([0, 0, 0, 0, 5.0])
     comparison = compared(recorded(np.arange(60), error))
     gripper = comparison.groups[2]
@@ -102,9 +97,7 @@ def joints(comparison: Comparison, scale: list[float]) -> Comparison:
     return replace(comparison, names=names, units=("rad",) * 5, scale=np.array(scale))
 
 
-def test_what_hardly_moves_beside_its_like_is_told_and_can_be_left_out(
-    recorded: Recorded, compared: Compared
-) -> None:
+def test_what_hardly_moves_beside_its_like_is_told_and_can_be_left_out(recorded, compared):
     """By the yardstick of `stages.inspect`: a hundredth of the upper quartile of three or more."""
     error = np.array([0.1, 0.1, 0.1, 0.001, 0.001])
     found = joints(compared(recorded(np.arange(60), error)), [1.0, 1.0, 1.0, 0.0099, 0.0101])
@@ -125,9 +118,7 @@ def test_what_hardly_moves_beside_its_like_is_told_and_can_be_left_out(
         ({"scale": np.array([0.0, 0.0, 0.0, 1.0, 0.001])}, set()),
     ],
 )
-def test_only_what_has_its_like_may_be_still(
-    recorded: Recorded, compared: Compared, changed: dict[str, Any], still: set[int]
-) -> None:
+def test_only_what_has_its_like_may_be_still(recorded, compared, changed, still):
     """Joints that are called after limbs are alike by their unit."""
     comparison = compared(recorded(np.arange(60)))
     assert comparison.low_variance() == {}
@@ -135,9 +126,7 @@ def test_only_what_has_its_like_may_be_still(
     assert changed_joints.low_variance().keys() == still
 
 
-def test_the_overall_error_of_episodes_of_one_length_is_their_mean(
-    recorded: Recorded, compared: Compared
-) -> None:
+def test_the_overall_error_of_episodes_of_one_length_is_their_mean(recorded, compared):
     rng = np.random.default_rng(0)
     comparison = compared(recorded(np.arange(60), rng.normal(size=(60, 1, 5)), horizon=1))
     by_episode = comparison.overall_by_episode("policy")

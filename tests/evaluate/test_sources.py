@@ -1,7 +1,7 @@
 """Curves of a training and frames of recordings are those of the policy and store, or none."""
 
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -173,9 +173,7 @@ def test_another_frame_under_the_same_name_is_not_shown(root: Path) -> None:
         ("new", lambda path: [file.unlink() for file in path.iterdir() if file.is_file()]),
     ],
 )
-def test_what_cannot_be_read_is_said_in_one_sentence(
-    root: Path, format: str, spoil: Callable[[Path], None]
-) -> None:
+def test_what_cannot_be_read_is_said_in_one_sentence(root, format, spoil):
     one = stored(root, format)
     spoil(one.recording.path)
     found = one.frames([0], root)

@@ -73,9 +73,7 @@ def test_several_executed_steps_have_the_first_beside_them(comparison: Compariso
     assert "first step" in error_text(several).splitlines()[-1]
 
 
-def test_samples_and_phases_are_there_where_they_are_known(
-    predictions: Predictions, comparison: Comparison
-) -> None:
+def test_samples_and_phases_are_there_where_they_are_known(predictions, comparison):
     phases = np.where(TICKS < 60, "approach", "hold")
     others = {
         name: np.zeros((60, 4, 5), np.float32) for name in (*BASELINES, "mean of n", "best of n")
@@ -98,9 +96,7 @@ def test_the_text_has_both_tables_and_the_verdicts(comparison: Comparison) -> No
     assert text.splitlines()[-1].count("resolved better") == 2
 
 
-def test_of_one_group_it_is_said_that_there_is_no_interval(
-    recorded: Callable[..., Predictions], compared: Callable[[Predictions], Comparison]
-) -> None:
+def test_of_one_group_it_is_said_that_there_is_no_interval(recorded, compared):
     text = error_text(compared(recorded(np.arange(30, 60), 0.1)))
     assert NO_INTERVAL in text and text.endswith(
         " five folds test each recording once (docs/training.md)"
@@ -121,9 +117,7 @@ def test_dimensions_that_hardly_move_are_said_below_the_table(comparison: Compar
     assert moving.overall("policy") < 0.01 * still.overall("policy")
 
 
-def test_files_hold_every_dimension_step_episode_and_tick(
-    comparison: Comparison, predictions: Predictions, store: FeatureStore, tmp_path: Path
-) -> None:
+def test_files_hold_every_dimension_step_episode_and_tick(comparison, predictions, store, tmp_path):
     files = write_tables(tmp_path, judged(comparison, predictions, store))
     assert sorted(file.name for file in files) == sorted(file.name for file in tmp_path.iterdir())
     assert json.loads((tmp_path / "metrics.json").read_text()) == metrics(comparison)
@@ -168,21 +162,14 @@ def test_files_hold_every_dimension_step_episode_and_tick(
     assert float(tick["dx_predicted"]) - float(tick["dx_recorded"]) == pytest.approx(0.1, abs=1e-5)
 
 
-def test_a_step_no_chunk_reaches_is_empty(
-    recorded: Callable[..., Predictions],
-    compared: Callable[[Predictions], Comparison],
-    store: FeatureStore,
-    tmp_path: Path,
-) -> None:
+def test_a_step_no_chunk_reaches_is_empty(recorded, compared, store, tmp_path):
     predictions = recorded(np.array([28, 58]))
     write_tables(tmp_path, judged(compared(predictions), predictions, store))
     lines = (tmp_path / "steps.csv").read_text().splitlines()
     assert lines[3:] == [f"2{',' * 18}", f"3{',' * 18}"] and ",," not in lines[2]
 
 
-def test_what_a_report_is_linked_to_is_not_written(
-    comparison: Comparison, predictions: Predictions, store: FeatureStore, tmp_path: Path
-) -> None:
+def test_what_a_report_is_linked_to_is_not_written(comparison, predictions, store, tmp_path):
     """As DVC restores an output: every file a link into its cache."""
     report, cache = tmp_path / "report", tmp_path / "cache"
     report.mkdir()
@@ -195,9 +182,7 @@ def test_what_a_report_is_linked_to_is_not_written(
     assert json.loads((report / "metrics.json").read_text()) == metrics(comparison)
 
 
-def test_a_full_disk_is_named(
-    comparison: Comparison, predictions: Predictions, store: FeatureStore, monkeypatch, tmp_path
-) -> None:
+def test_a_full_disk_is_named(comparison, predictions, store, monkeypatch, tmp_path):
     def full(path: Path, *rest: object, **named: object) -> None:
         raise OSError(28, "No space left on device")
 

@@ -35,16 +35,6 @@ def nothing(line: str) -> None:
     """Says nothing."""
 
 
-@pytest.mark.parametrize("harm", ["flipped", "gone"])
-def test_it_is_named_by_every_stage_that_reads(store: Path, params: Path, here, harm) -> None:
-    HARMS[harm](store / CHUNKS[0])
-    for stage in ("stages.verify", "stages.train_head"):
-        code, _, complained = here(stage, params)
-        assert code == 2
-        assert CHUNKS[0] in complained
-        assert "stages.verify --repair" in complained
-
-
 @pytest.fixture(scope="module")
 def right(extracted, write_episode, tmp_path_factory) -> FeatureStore:
     """What extraction makes of an undamaged store and one more episode."""
@@ -62,8 +52,8 @@ def right(extracted, write_episode, tmp_path_factory) -> FeatureStore:
 
 @each_harm
 def test_an_extraction_beside_it_takes_no_wrong_row(
-    document, store: Path, recordings: Path, write_episode, right: FeatureStore, harm, chunk
-) -> None:
+    document, store, recordings, write_episode, right, harm, chunk
+):
     """Of the old store only rows that give their checksums are taken; streams are read anew."""
     write_episode(recordings / "Touch_dot" / "episode_4", 4)
     HARMS[harm](store / chunk)

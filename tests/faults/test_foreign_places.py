@@ -2,7 +2,6 @@
 
 import os
 import shutil
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -84,9 +83,7 @@ def plant(place: Path, foreign: str) -> None:
         ("tuned logs", "dvclive"),
     ],
 )
-def test_is_left_as_it_is(
-    writer: str, foreign: str, params: Path, here: Callable[..., tuple[int, str, str]], tmp_path
-) -> None:
+def test_is_left_as_it_is(writer, foreign, params, here, tmp_path):
     command, below, settings = WRITERS[writer]
     store, place = tmp_path / "stores" / "made.zarr", tmp_path / below
     options = [one.replace("{}", str(place)).replace("{tmp}", str(tmp_path)) for one in settings]

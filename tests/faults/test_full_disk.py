@@ -72,13 +72,8 @@ def test_extract(document, small_disk: Path, full_then_free, params: Path, leave
 
 
 def test_train_and_evaluate(
-    tiny_store: Callable[..., Path],
-    head_params,
-    small_disk: Path,
-    full_then_free,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+    tiny_store, head_params, small_disk, full_then_free, tmp_path, monkeypatch
+):
     # Of this process, which has room: most of the time goes into pictures.
     monkeypatch.setattr("pipeline.look.page.writing.write_report", lambda *_: [])
     store = tiny_store(tmp_path)
@@ -94,9 +89,7 @@ def test_train_and_evaluate(
     assert (report / "metrics.json").exists()
 
 
-def test_merge(
-    tiny_store: Callable[..., Path], head_params, small_disk: Path, full_then_free, tmp_path: Path
-) -> None:
+def test_merge(tiny_store, head_params, small_disk, full_then_free, tmp_path):
     inputs = [
         str(tiny_store(tmp_path, name=name, seed=seed, sensor_channels=50))
         for seed, name in enumerate("ab")

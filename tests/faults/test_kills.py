@@ -68,8 +68,8 @@ def kill_after(fork) -> Callable[..., None]:
     ("kills", "seed"), [(2, 0), *(pytest.param(8, n, marks=pytest.mark.slow) for n in range(1, 4))]
 )
 def test_a_training_killed_again_and_again(
-    tiny_store: Callable[..., Path], head_params, kill_after, here, tmp_path: Path, kills, seed
-) -> None:
+    tiny_store, head_params, kill_after, here, tmp_path, kills, seed
+):
     """Between checkpoints, while one is written, while it is judged: wherever the kill falls."""
     chance = random.Random(seed)
     path = tiny_store(tmp_path)
@@ -89,9 +89,7 @@ def test_a_training_killed_again_and_again(
     assert not list((tmp_path / "killed").glob("head.part*"))
 
 
-def test_a_merge_killed_again_and_again(
-    tiny_store: Callable[..., Path], head_params, kill_after, here, tmp_path: Path
-) -> None:
+def test_a_merge_killed_again_and_again(tiny_store, head_params, kill_after, here, tmp_path):
     chance = random.Random(0)
     inputs = [str(tiny_store(tmp_path, name=name, seed=seed)) for seed, name in enumerate("ab")]
     params = head_params(Path("unused.zarr"))

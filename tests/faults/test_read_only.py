@@ -26,9 +26,7 @@ def read_only(store: Path, tmp_path: Path) -> Iterator[Path]:
         subprocess.run(["umount", "-l", str(place)], check=True)
 
 
-def test_stage_two_and_every_check_work(
-    read_only: Path, params: Path, here, tmp_path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_stage_two_and_every_check_work(read_only, params, here, tmp_path, monkeypatch):
     monkeypatch.setattr("pipeline.look.page.writing.write_report", lambda *_: [])
     options = ["--set", f"extract.store={read_only}"]
     for name, *more in (
@@ -43,9 +41,7 @@ def test_stage_two_and_every_check_work(
     assert read_only.name in said
 
 
-def test_an_extraction_into_it_says_what_is_wrong_and_where(
-    read_only: Path, params: Path, here
-) -> None:
+def test_an_extraction_into_it_says_what_is_wrong_and_where(read_only, params, here):
     options = ["--set", f"extract.store={read_only}"]
     code, said, complained = here("stages.extract", params, *options)
     assert code == 0, complained

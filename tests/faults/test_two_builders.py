@@ -24,8 +24,8 @@ def extract_until_sealing(params: Path, told: Connection) -> None:
 
 
 def test_the_second_is_refused_and_a_killed_first_is_none(
-    params: Path, store: Path, recordings: Path, write_episode, fork, here
-) -> None:
+    params, store, recordings, write_episode, fork, here
+):
     write_episode(recordings / "Touch_dot" / "episode_4", 4)
     first, heard = fork(extract_until_sealing, params)
     try:

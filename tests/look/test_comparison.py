@@ -1,8 +1,6 @@
 """Experiments side by side are one page: a table for each span of the chunk, and one picture."""
 
-from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -46,9 +44,7 @@ def experiments() -> list[Experiment]:
 
 
 @pytest.mark.slow
-def test_the_page_is_sound(
-    experiments: list[Experiment], tmp_path: Path, assert_page_is_sound: Callable[[Path], None]
-) -> None:
+def test_the_page_is_sound(experiments, tmp_path, assert_page_is_sound):
     write_report(tmp_path, comparison_report(experiments))
     assert_page_is_sound(tmp_path / PAGE)
 

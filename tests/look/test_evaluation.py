@@ -33,7 +33,6 @@ from pipeline.train.scores import action_space, compare
 from pipeline.train.split import Split
 from pipeline.train.training_data import source_of, split_parts
 
-Sound = Callable[[Path], None]
 PARAMS = TrainHeadParams.model_validate(
     {
         "sensor_encoder": {"channels": [8], "layers": 0, "heads": 1, "output_dim": 8},
@@ -148,9 +147,7 @@ def test_the_verdict_is_a_sentence(
     assert ("vla-cache rollout" in advice) == ("less" in verdict)
 
 
-def test_an_anchored_policy_is_judged_by_rollouts(
-    judgement: Evaluation, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_anchored_policy_is_judged_by_rollouts(judgement, monkeypatch):
     error, none = Figure(3.0, None, None), Figure(1.0, None, None)
     rivals = Rivalry(error, "linear_fit", none, Figure(2.0, 1.0, 3.0))
     monkeypatch.setattr("pipeline.look.evaluation.rivalry", lambda part: rivals)
@@ -194,16 +191,12 @@ def test_what_spoils_the_judgement_stands_at_the_top(judgement: Evaluation) -> N
 
 
 @pytest.mark.slow
-def test_the_page_is_sound(
-    judgement: Evaluation, tmp_path: Path, assert_page_is_sound: Sound
-) -> None:
+def test_the_page_is_sound(judgement, tmp_path, assert_page_is_sound):
     write_report(tmp_path, evaluation_report(judgement))
     assert_page_is_sound(tmp_path / PAGE)
 
 
-def test_episodes_are_shown_with_frames_and_without(
-    judgement: Evaluation, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_episodes_are_shown_with_frames_and_without(judgement, monkeypatch):
     """Frames of the best episode; the worst one's recording is where no recording is."""
     (_, best), (_, worst) = judgement.comparison.extremes()
     look = evaluation_page.read_episode_frames

@@ -79,11 +79,9 @@ def pictures(comparison: Comparison, predictions: Predictions, store: Any) -> di
 
 
 @pytest.mark.parametrize(
-    ("episodes", "dimensions", "constant", "horizon"), [(3, 14, 1, 20), (1, 1, 0, 1)]
+    ("episodes", "dimensions", "constant", "horizon"), [(2, 6, 1, 8), (1, 1, 0, 1)]
 )
-def test_every_picture_is_written(
-    tmp_path: Path, episodes: int, dimensions: int, constant: int, horizon: int
-) -> None:
+def test_every_picture_is_written(tmp_path, episodes, dimensions, constant, horizon):
     shown = evaluated(episodes, dimensions, constant=constant, horizon=horizon)
     files = write(tmp_path, pictures(*shown))
     assert len(files) == 5 and all(file.stat().st_size > 5000 for file in files)

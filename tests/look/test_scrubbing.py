@@ -2,7 +2,6 @@
 
 import re
 import sys
-from collections.abc import Callable
 from pathlib import Path
 from subprocess import run
 
@@ -12,8 +11,6 @@ from pipeline.base.config import Params
 from pipeline.base.errors import ConfigError
 from pipeline.look.scrubbing import write_episodes
 from pipeline.look.subject import subject_of
-from pipeline.simulation.insertion_formats import write_raw
-from pipeline.simulation.recorder import simulate_episode
 from pipeline.store import FeatureStore
 
 
@@ -41,10 +38,9 @@ def rows_by_place(file: Path) -> dict[str, int]:
 
 
 @pytest.mark.extra
-def test_a_recording_is_there_with_all_that_moves_in_it(tmp_path: Path) -> None:
+def test_a_recording_is_there_with_all_that_moves_in_it(recorded, tmp_path):
     pytest.importorskip("rerun")
-    write_raw(tmp_path / "raw" / "task", simulate_episode(5, 1.7e9))
-    params = params_of(tmp_path / "raw", tmp_path / "out")
+    params = params_of(recorded, tmp_path / "out")
     subject = subject_of(params)
     (recording,) = subject.recordings(None).recordings
     (file,) = write_episodes(subject, params)
@@ -57,9 +53,7 @@ def test_a_recording_is_there_with_all_that_moves_in_it(tmp_path: Path) -> None:
 
 
 @pytest.mark.extra
-def test_a_store_is_there_with_the_similarity_of_its_rows(
-    tiny_store: Callable[..., Path], tmp_path: Path
-) -> None:
+def test_a_store_is_there_with_the_similarity_of_its_rows(tiny_store, tmp_path):
     pytest.importorskip("rerun")
     path = tiny_store(tmp_path)
     params = params_of(path, tmp_path / "out")
@@ -70,9 +64,7 @@ def test_a_store_is_there_with_the_similarity_of_its_rows(
     assert rows["state"] == len(episode.states)
 
 
-def test_without_rerun_the_error_says_what_to_install(
-    tiny_store: Callable[..., Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_without_rerun_the_error_says_what_to_install(tiny_store, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "rerun", None)
     params = params_of(tiny_store(tmp_path), tmp_path / "out")
     with pytest.raises(ConfigError, match=r"\[rerun\]"):

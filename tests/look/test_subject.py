@@ -58,9 +58,7 @@ def test_a_store_is_looked_at_alone(tmp_path: Path, tiny_store: Callable[..., Pa
     assert f"python -m stages.inspect {one}" in refused(tmp_path / "*.zarr")
 
 
-def test_every_path_has_a_folder_of_its_own(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_every_path_has_a_folder_of_its_own(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for place in ("lab/day 1/run", "lab/day2/run"):
         (tmp_path / place).mkdir(parents=True)
@@ -82,9 +80,7 @@ def test_every_path_has_a_folder_of_its_own(
         assert subject_of(looking_at(place)).folder == Path("reports/inspect", place)
 
 
-def test_a_page_that_could_not_be_written_is_refused_first(
-    tmp_path: Path, tiny_store: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_page_that_could_not_be_written_is_refused_first(tmp_path, tiny_store, monkeypatch):
     def refusal(output: Path) -> str:
         with pytest.raises(ConfigError, match=r"--set inspect\.output=FOLDER") as caught:
             subject_of(looking_at(tmp_path, output=output))

@@ -1,5 +1,4 @@
-"""A head trained on a recorded episode; and a policy of the phantom, a stand-in for its model and a
-server in this process."""
+"""A policy of the phantom, a stand-in for its model and a server in this process."""
 
 import gc
 import socket
@@ -13,9 +12,8 @@ import numpy as np
 import pytest
 import torch
 
-from pipeline.base.config import Params, ServeParams, TrainHeadParams
+from pipeline.base.config import Params, ServeParams, TrainHeadParams, load_params
 from pipeline.compat.unified import no_normalization
-from pipeline.extract.run import extract
 from pipeline.policy.checkpoint import PolicyCheckpoint, find_policy, load_policy
 from pipeline.policy.observation import PolicyShape
 from pipeline.policy.policy import Policy
@@ -24,13 +22,7 @@ from pipeline.robot.process import PolicyThread
 from pipeline.robot.server import PolicyServer, listen
 from pipeline.robot.session import ServedPolicy
 from pipeline.simulation.insertion import INSTRUCTION
-from pipeline.simulation.insertion_formats import write_raw
-from pipeline.simulation.recorder import simulate_episode
 from pipeline.simulation.rendering import VIEWS
-from pipeline.store import FeatureStore
-from pipeline.train.loop import Trainer
-from pipeline.train.run import open_run
-from pipeline.train.split import split_by_episode
 
 SLOTS, DIM = 2, 4
 GROUPS = ("translation",) * 3 + ("rotation",) * 3 + ("gripper",)
@@ -227,43 +219,13 @@ def serving() -> Any:
         bound.close()
 
 
-@pytest.fixture(scope="package")
-def params(
-    tmp_path_factory: pytest.TempPathFactory,
-    demo_checkpoint: Path,
-    tiny_head: Callable[..., dict[str, Any]],
-) -> Params:
-    """Params of one recorded episode, whose store is extracted."""
-    root = tmp_path_factory.mktemp("live")
-    write_raw(root / "raw" / "Red_point", simulate_episode(5, 1.7e9))
-    vlm = {
-        "checkpoint": str(demo_checkpoint),
-        "image_resize_height": 56,
-        "image_resize_width": 84,
-        "dtype": "float32",
-        "pooling": ["mean", "grid"],
-    }
-    document = {
-        "data": {"root": str(root), "sources": [{"name": "raw", "path": "raw"}]},
-        "vlm": vlm,
-        "extract": {"store": str(root / "store.zarr")},
-        "train_head": tiny_head(root),
-    }
-    params = Params.model_validate(document)
-    extract(params, say=lambda _: None)
-    return params
+@pytest.fixture(scope="session")
+def params(trained_once: Path) -> Params:
+    """Params of two recorded episodes, whose store is extracted and whose head is trained."""
+    return load_params(trained_once)
 
 
-@pytest.fixture(scope="package")
-def head(params: Params) -> Path:
-    """The output of a training of a few steps."""
-    wanted, store = params.train_head, FeatureStore.open(params.extract.store)
-    split = split_by_episode(store, wanted.split, wanted.horizon)
-    Trainer(store, wanted, split, open_run(wanted, store)).fit()
-    return wanted.output
-
-
-@pytest.fixture(scope="package")
-def checkpoint(head: Path) -> PolicyCheckpoint:
+@pytest.fixture(scope="session")
+def checkpoint(params: Params) -> PolicyCheckpoint:
     """The policy of that training."""
-    return load_policy(find_policy(head))
+    return load_policy(find_policy(params.train_head.output))

@@ -6,7 +6,6 @@ import socket
 import subprocess
 import sys
 import threading
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +16,6 @@ from pipeline.base.errors import CheckpointMismatch, ObservationError, ServerErr
 from pipeline.robot.client import PolicyClient, refuse_other_robot
 
 ROOT = Path(__file__).resolve().parents[2]
-Observe = Callable[..., dict[str, Any]]
 
 LIGHT = """
 import sys
@@ -64,7 +62,7 @@ def test_a_reset_goes_with_the_next_observation(served_policy, serving, observe)
 
 def test_a_refused_observation_says_why_and_the_client_can_begin_again(
     served_policy, serving, observe
-) -> None:
+):
     with PolicyClient(serving(served_policy()).address) as client:
         with pytest.raises(ObservationError, match=r"^sensors: expected one of.* sensor"):
             client.infer(observe(0, sensors=np.zeros(3)))

@@ -139,9 +139,7 @@ def driven(
     return run
 
 
-def test_an_arm_is_driven_recorded_and_disconnected(
-    lerobot: Any, driven: Callable[..., Any], tmp_path: Path
-) -> None:
+def test_an_arm_is_driven_recorded_and_disconnected(lerobot, driven, tmp_path):
     report, said = driven("step: {most: {translation: 100}}")
     arm = sys.modules["lerobot.robots.fake_arm"].Arm.ARMS[-1]
     assert (arm.log[0], arm.log[-1]) == ("connect", "disconnect")
@@ -161,9 +159,7 @@ LIMITS = {
 
 
 @pytest.mark.parametrize("limits", LIMITS.values(), ids=LIMITS)
-def test_each_limit_stops_the_arm_and_the_run_is_kept(
-    limits: str, lerobot: Any, driven: Callable[..., Any], tmp_path: Path
-) -> None:
+def test_each_limit_stops_the_arm_and_the_run_is_kept(limits, lerobot, driven, tmp_path):
     kind = "outside the workspace" if "workspace" in limits else "action beyond limits"
     with pytest.raises(RobotStopped, match=kind):
         driven(limits)
@@ -172,8 +168,8 @@ def test_each_limit_stops_the_arm_and_the_run_is_kept(
 
 
 def test_an_arm_that_cannot_be_disconnected_does_not_hide_why_it_stopped(
-    lerobot: Any, driven: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
-) -> None:
+    lerobot, driven, monkeypatch
+):
     def pulled(self: Any) -> None:
         raise ConnectionError("no answer on the bus")
 
@@ -183,9 +179,7 @@ def test_an_arm_that_cannot_be_disconnected_does_not_hide_why_it_stopped(
     assert any("was not disconnected (no answer on the bus)" in line for line in said)
 
 
-def test_a_second_ctrl_c_does_not_cut_the_disconnection(
-    lerobot: Any, driven: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_second_ctrl_c_does_not_cut_the_disconnection(lerobot, driven, monkeypatch):
     left: list[str] = []
 
     def disconnect(self: Any) -> None:
@@ -201,9 +195,7 @@ def test_without_limits_it_warns(lerobot: Any, driven: Callable[..., Any]) -> No
     assert any("drive.limits" in line for line in driven()[1])
 
 
-def test_what_cannot_be_driven_is_refused_by_its_key(
-    lerobot: Any, driven: Callable[..., Any]
-) -> None:
+def test_what_cannot_be_driven_is_refused_by_its_key(lerobot, driven):
     wrong: dict[str, dict[str, Any]] = {
         "drive.robot: expected module:Class": {"robot": "arm"},
         "drive.robot: no_such:Arm": {"robot": "no_such:Arm"},
@@ -226,8 +218,8 @@ def test_the_default_robot_is_the_simulated_arm() -> None:
 
 
 def test_a_class_of_the_current_folder_is_found_and_its_description_compared(
-    driven: Callable[..., Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    driven, tmp_path, monkeypatch
+):
     monkeypatch.chdir(tmp_path)
     text = (
         "class Arm:\n    def __init__(self, hz=1):\n        self.description = {'action_hz': hz}\n"

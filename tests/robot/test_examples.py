@@ -21,7 +21,7 @@ def test_an_example_is_short(example: Path) -> None:
 
 def test_the_simulated_arm_runs_over_the_wire_and_refuses_a_policy_for_another_robot(
     served_policy, serving, capsys
-) -> None:
+):
     served = served_policy()
     phantom = {"state": STATE, "sensor": SENSOR}
     served.metadata["streams"] = served.metadata["streams"] | {

@@ -212,9 +212,7 @@ def test_every_format_is_the_policy(kind: dict[str, Any], export_of) -> None:
 @pytest.mark.parametrize(
     "kind", [FLOW, pytest.param({"model_type": "regression"}, marks=pytest.mark.slow)], ids=str
 )
-def test_an_exported_head_answers_for_its_policy_alone(
-    kind: dict[str, Any], export_of, tmp_path
-) -> None:
+def test_an_exported_head_answers_for_its_policy_alone(kind, export_of, tmp_path):
     checkpoint, folder, _ = export_of(kind)
     head, policy = ExportedHead(folder, checkpoint), checkpoint.policy()
     seen = random_inputs(checkpoint, policy, 3, seed=5)

@@ -11,7 +11,6 @@ from pipeline.base.errors import CheckpointMismatch
 from pipeline.robot.lerobot_arm import LeRobotArm
 
 MOTORS = ("shoulder_pan", "elbow_flex", "gripper")
-SO101 = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll", "gripper")
 
 
 class Follower:
@@ -144,9 +143,7 @@ class Blocked(Follower):
 
 
 @pytest.mark.parametrize("hangs", [False, True])
-def test_stop_waits_for_a_command_under_way_but_not_for_one_that_hangs(
-    hangs: bool, monkeypatch
-) -> None:
+def test_stop_waits_for_a_command_under_way_but_not_for_one_that_hangs(hangs, monkeypatch):
     monkeypatch.setattr("pipeline.robot.lerobot_arm._PORT_S", 0.05 if hangs else 60.0)
     robot, said = Blocked(), list[str]()
     arm = LeRobotArm(robot, metadata_of(), {"View1": "front"}, say=said.append)

@@ -167,28 +167,6 @@ def test_a_velocity_is_a_speed_and_goes_on_where_nothing_is_sent_but_a_place_is_
     own.allow(np.array([90.0, -1.0]))
 
 
-@pytest.mark.parametrize(
-    ("stream", "channel", "value", "kind"),
-    [
-        ("sensor", 0, 2.1, StopKind.FORCE),
-        ("sensor", 0, -2.1, StopKind.FORCE),
-        ("state", 8, 200.0, StopKind.WORKSPACE),
-    ],
-)
-def test_the_examples_limits_of_what_is_measured_stop_the_phantom(
-    stream: str, channel: int, value: float, kind: StopKind
-) -> None:
-    insertion = NeedleInsertion()
-    insertion.reset(3)
-    observed = {"state": insertion.state.copy(), "sensor": insertion.sensor.copy()}
-    own = Limits.read(EXAMPLE, PHANTOM, HZ)
-    own.check(observed)
-    observed[stream][4, channel] = value
-    with pytest.raises(SafeStop, match=f"measured at {value:g}") as stop:
-        own.check(observed)
-    assert stop.value.kind == kind
-
-
 def test_demonstrations_keep_to_the_example() -> None:
     own, insertion = Limits.read(EXAMPLE, PHANTOM, HZ), NeedleInsertion()
     insertion.reset(6, "moved")

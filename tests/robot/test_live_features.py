@@ -27,9 +27,9 @@ Frames = Mapping[str, np.ndarray]
 
 def test_live_features_are_the_stored_ones(params: Params) -> None:
     store = FeatureStore.open(params.extract.store)
-    (recording,) = open_recordings(params.data.sources, params.data.root).recordings
+    recording, _ = open_recordings(params.data.sources, params.data.root).recordings
     cameras, times = recording.cameras(), store.array("vl/frame_time")
-    rows = np.arange(0, len(times), 3)
+    rows = np.arange(0, len(store.episodes[0].vl_rows), 3)
     frames: list[dict[str, np.ndarray]] = [{} for _ in rows]
     for place, (view, camera) in enumerate(sorted(cameras.items())):
         shown = np.searchsorted(camera.time, times[rows, place])
@@ -49,9 +49,7 @@ def test_live_features_are_the_stored_ones(params: Params) -> None:
         ({"dtype": "bfloat16"}, 'compute_dtype: "float32" -> "bfloat16"'),
     ],
 )
-def test_other_features_are_refused_before_a_weight_is_loaded(
-    params: Params, monkeypatch, changed: dict[str, Any], named: str
-) -> None:
+def test_other_features_are_refused_before_a_weight_is_loaded(params, monkeypatch, changed, named):
     def load(*args: Any) -> None:
         raise AssertionError("a weight is loaded")
 
@@ -62,9 +60,7 @@ def test_other_features_are_refused_before_a_weight_is_loaded(
 
 
 @pytest.mark.parametrize("what", ["weights", "adapter"])
-def test_another_model_is_refused_before_a_weight_is_loaded(
-    params: Params, tmp_path, monkeypatch, what: str
-) -> None:
+def test_another_model_is_refused_before_a_weight_is_loaded(params, tmp_path, monkeypatch, what):
     monkeypatch.setattr(LiveVLM, "load", None)
     trained = FeatureStore.open(params.extract.store).spec
     if what == "weights":
@@ -202,9 +198,7 @@ class TestRefused:
         assert 'feature spec, tokenizer: "0123" -> ' in said
 
 
-def test_half_precision_tolerates_its_own_noise_and_no_more(
-    params: Params, checkpoint: PolicyCheckpoint, live: LiveFeatures
-) -> None:
+def test_half_precision_tolerates_its_own_noise_and_no_more(params, checkpoint, live):
     spec = {**checkpoint.source["feature_spec"], "storage_dtype": "float16"}
     stored = replace(checkpoint, source={**checkpoint.source, "feature_spec": spec})
 

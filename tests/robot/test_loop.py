@@ -16,8 +16,6 @@ from pipeline.robot.loop import (
     ControlLoop,
     Executor,
     PlanGuide,
-    SafeStop,
-    StopKind,
     check_chunking,
     soft_mask,
 )
@@ -45,9 +43,7 @@ def play(executor: Executor, steps: int) -> list[float]:
 
 class TestDue:
     @pytest.mark.parametrize(("chunking", "execute"), [*zip(MODES, (1, 3, HORIZON), strict=True)])
-    def test_it_is_before_the_first_chunk_and_every_so_many_steps(
-        self, chunking: Chunking, execute: int
-    ) -> None:
+    def test_it_is_before_the_first_chunk_and_every_so_many_steps(self, chunking, execute):
         executor, observed = Executor(chunking, execute, HORIZON), []
         for tick in range(20):
             if executor.due:
@@ -59,7 +55,7 @@ class TestDue:
 
     def test_while_a_chunk_is_computed_no_other_is_due_and_a_late_one_is_as_old_as_its_observation(
         self,
-    ) -> None:
+    ):
         executor = Executor("none", 4, HORIZON)
         executor.begin()
         assert not executor.due
@@ -82,9 +78,7 @@ class TestDue:
 
 @pytest.mark.parametrize("chunking", MODES)
 class TestSteps:
-    def test_a_chunk_used_up_gives_no_action_and_a_second_begin_replaces_the_first(
-        self, chunking: Chunking
-    ) -> None:
+    def test_a_chunk_used_up_gives_no_action_and_a_second_begin_replaces_the_first(self, chunking):
         executor = Executor(chunking, 2, HORIZON)
         with pytest.raises(AssertionError, match="begin"):
             executor.plan(chunk_of(0))
@@ -121,9 +115,7 @@ class TestSteps:
         assert play(executor, 2) == [1, 2] and action.dtype == np.float32
 
     @given(st.lists(st.tuples(st.booleans(), st.integers(0, 3)), max_size=30))
-    def test_whatever_the_delays_every_step_is_that_of_its_tick(
-        self, chunking: Chunking, turns: list[tuple[bool, int]]
-    ) -> None:
+    def test_whatever_the_delays_every_step_is_that_of_its_tick(self, chunking, turns):
         """Others drop as many steps as the computation is believed to have taken."""
         executor, tick = Executor(chunking, 1, HORIZON), 0
         take(executor, chunk_of(0))
@@ -139,9 +131,7 @@ class TestSteps:
 
 
 @pytest.mark.parametrize("chunking", MODES)
-def test_temporal_averages_all_chunks_that_reach_a_tick_and_others_play_the_newest(
-    chunking: Chunking,
-) -> None:
+def test_temporal_averages_all_chunks_that_reach_a_tick_and_others_play_the_newest(chunking):
     """In closed form: the newest weighs most."""
     executor, horizon = Executor(chunking, 1, 3), 3
     names = [5.0, -1.0, 2.0, 8.0]
@@ -166,9 +156,7 @@ class TestMoving:
         return np.tile(np.array([step, place], np.float32), (HORIZON, 1))
 
     @given(st.data(), st.sampled_from(["none", "rtc"]), st.integers(1, HORIZON))
-    def test_a_chunk_in_time_is_played_as_it_is(
-        self, data: st.DataObject, chunking: Chunking, execute: int
-    ) -> None:
+    def test_a_chunk_in_time_is_played_as_it_is(self, data, chunking, execute):
         executor, steps = self.executor(chunking, execute), st.floats(-3, 3, width=32)
         for _ in range(4):
             chunk = np.array([[data.draw(steps), 7.0] for _ in range(HORIZON)], np.float32)
@@ -176,9 +164,7 @@ class TestMoving:
             played = np.stack([executor.next_action() for _ in range(execute)])
             np.testing.assert_allclose(played, chunk[:execute], atol=1e-6)
 
-    def test_a_late_chunk_leads_to_where_it_meant_to_and_the_guide_is_what_will_be_played(
-        self,
-    ) -> None:
+    def test_a_late_chunk_leads_to_where_it_meant_to_and_the_guide_is_what_will_be_played(self):
         """What an older chunk moved meanwhile is not moved again."""
         executor = self.executor("rtc")
         take(executor, self.deltas(1.0))
@@ -236,8 +222,8 @@ class TestGuide:
 
     @pytest.mark.parametrize(("played", "execute"), [(0, 3), (3, 5), (7, 1)])
     def test_it_is_the_rest_of_the_plan_and_what_the_plan_does_not_reach_weighs_nothing(
-        self, played: int, execute: int
-    ) -> None:
+        self, played, execute
+    ):
         """Zeros with weight would decode to the mean action."""
         executor = self.under_way(execute, played)
         guide = executor.begin()
@@ -330,8 +316,8 @@ def run(loop: ControlLoop, ticks: int, latency: int = 0) -> Iterator[tuple[bool,
     ],
 )
 def test_the_model_looks_every_third_tick_and_the_head_answers_as_often_as_it_is_asked(
-    execute: int, latency: int, passes: list[int], asked: list[int]
-) -> None:
+    execute, latency, passes, asked
+):
     """A robot stands still until its first chunk is there; the next episode begins with nothing."""
     loop = make_loop(execute)
     for _ in range(2):
@@ -346,50 +332,3 @@ def test_a_policy_without_features_needs_no_frames() -> None:
     loop = make_loop(uses_features=False)
     loop.begin_tick()
     assert not loop.frames_due and loop.chunk_due
-
-
-def test_a_refused_question_is_asked_again_with_its_frames_and_no_other_pass_is_touched() -> None:
-    loop = make_loop()
-    for _ in range(2):
-        loop.begin_tick()
-        assert loop.frames_due and loop.chunk_due
-        loop.pass_began()
-        loop.ask()
-        loop.refused()
-    loop.begin_tick()
-    loop.pass_began()
-    loop.ask()
-    loop.plan(chunk_of(0))
-    for _ in range(3):
-        loop.action()
-        loop.begin_tick()
-        assert loop.chunk_due
-        loop.ask()
-        loop.refused()
-    assert not loop.frames_due, "the pass is still under way"
-    loop.pass_ended()
-    assert loop.frames_due
-
-
-def test_a_plan_that_is_used_up_is_a_safe_stop() -> None:
-    loop = make_loop(uses_features=False)
-    loop.begin_tick()
-    loop.ask()
-    loop.plan(chunk_of(1))
-    for _ in range(HORIZON):
-        loop.action()
-    with pytest.raises(SafeStop) as stopped:
-        loop.action()
-    assert stopped.value.kind == StopKind.NO_CHUNK
-
-
-@pytest.mark.parametrize("bad", [np.nan, np.inf])
-def test_an_action_that_is_no_number_is_a_safe_stop(bad: float) -> None:
-    loop = make_loop(uses_features=False)
-    loop.begin_tick()
-    loop.ask()
-    chunk = np.zeros((HORIZON, 2), np.float32)
-    chunk[-1, 1] = bad
-    with pytest.raises(SafeStop, match="not a number") as stopped:
-        loop.plan(chunk)
-    assert stopped.value.kind == StopKind.NOT_A_NUMBER

@@ -1,6 +1,5 @@
 """What a robot says is checked; a refusal names the field, what was expected and what was found."""
 
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -9,8 +8,6 @@ import pytest
 from pipeline.base.errors import ConfigError, ObservationError
 from pipeline.robot.observation import KEY_MAPS, Doubts, ObservationReader
 from pipeline.simulation.rendering import VIEWS
-
-Observe = Callable[..., dict[str, Any]]
 
 METADATA = {
     "streams": {
@@ -112,9 +109,7 @@ STATE, STATE_TIME = np.zeros((10, 12)), np.arange(1, 11) / 100
         ({"guide/chunk": np.zeros((4, 7)), "guide/weight": np.full(4, 2)}, "expected 0 to 1"),
     ],
 )
-def test_what_is_wrong_is_refused_by_name_and_leaves_no_trace(
-    reader, observe, wrong: dict[str, Any], said: str
-) -> None:
+def test_what_is_wrong_is_refused_by_name_and_leaves_no_trace(reader, observe, wrong, said):
     with pytest.raises(ObservationError, match=said) as refused:
         reader.read(observe(0, **wrong))
     assert len(str(refused.value)) < 600

@@ -90,7 +90,7 @@ def run(python: Path, address: str, key: str, observations: list[Any]) -> tuple[
 
 def test_it_gets_what_our_client_gets_bit_for_bit(
     python_of_openpi, served_policy, serving, observe
-) -> None:
+):
     """With its chunk broker, which takes every array of an answer for one of steps."""
     served = served_policy("flow_matching", horizon=EXECUTE, told=("go",))
     server = serving(served, token="s3cret")

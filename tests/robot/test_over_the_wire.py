@@ -35,11 +35,12 @@ def over_the_wire(served: Any, serving: Served, **changed: Any) -> Rollouts:
     [
         ("regression", {"chunking": "temporal", "level": "moved", "latency_ms": [400, 100]}),
         ("flow_matching", {"chunking": "rtc"}),
+        ("diffusion", {}),
     ],
 )
 def test_the_same_seed_gives_the_same_episode_bit_for_bit(
-    model_type: str, changed: dict[str, Any], served_policy, serving
-) -> None:
+    model_type, changed, served_policy, serving
+):
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:

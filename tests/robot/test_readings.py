@@ -69,9 +69,7 @@ def test_an_observation_is_a_copy_with_the_true_ages() -> None:
 
 
 @pytest.mark.parametrize("oldest_s", [None, 0.03, 0.05, 0.5])
-def test_a_robot_sees_what_training_sees_of_the_same_readings(
-    tiny_store, tmp_path, oldest_s: float | None
-) -> None:
+def test_a_robot_sees_what_training_sees_of_the_same_readings(tiny_store, tmp_path, oldest_s):
     """At every tick of an episode that is felt reading by reading; a window is as old as a whole
     number of readings, but for rounding."""
     store = FeatureStore.open(tiny_store(tmp_path))

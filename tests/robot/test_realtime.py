@@ -463,9 +463,7 @@ def test_a_stream_that_stalls_stops_the_robot_unless_nobody_watches_or_looks_at_
         (put("sensor", np.array([[np.nan]], np.float32)), StopKind.NOT_A_NUMBER),
     ],
 )
-def test_a_stream_that_limits_are_of_is_watched_whatever_the_policy_looks_at(
-    spoil: Callable[[Observed], Any], kind: StopKind
-) -> None:
+def test_a_stream_that_limits_are_of_is_watched_whatever_the_policy_looks_at(spoil, kind):
     brain = Brain(looks_at=["features", "state"])
     force = limits(force={"most": {"force": 2.5}})
     report = stopped(Arm(after(9, spoil)), kind, "sensor", brain, limits=force, stalled_s=0.15)
@@ -622,9 +620,7 @@ def test_an_action_that_the_robot_failed_at_is_recorded() -> None:
         (put("state", np.array([[0.1, None], [0.1, None]], object)), StopKind.LOOP, "check"),
     ],
 )
-def test_readings_that_cannot_be_checked_are_kept_from_the_recording(
-    spoil: Callable[[Observed], Any], kind: StopKind, said: str
-) -> None:
+def test_readings_that_cannot_be_checked_are_kept_from_the_recording(spoil, kind, said):
     arm, notes = Arm(after(9, spoil)), Notes()
     stopped(arm, kind, said, recorder=notes)
     assert len(notes.ticks) == 9
@@ -645,9 +641,7 @@ def test_parts_that_did_not_happen_in_a_tick_are_not_counted() -> None:
 @pytest.mark.parametrize(
     ("changed", "said"), [({"hz": 100.0}, r"hz=100, .* found 200"), ({"execute": 41}, "execute")]
 )
-def test_what_does_not_fit_is_refused_before_anything_is_asked(
-    changed: dict[str, Any], said: str
-) -> None:
+def test_what_does_not_fit_is_refused_before_anything_is_asked(changed, said):
     arm = Arm()
     with pytest.raises(ConfigError, match=said):
         run_robot(arm, Brain(), replace(CALM, **changed), limits(step={"most": {"dx": 1}}))

@@ -278,9 +278,7 @@ def test_images_that_find_no_room_are_dropped_and_counted(tmp_path, monkeypatch)
     assert shades(camera) == [0]
 
 
-def test_a_disk_that_does_not_keep_up_fails_the_recording_not_the_run(
-    tmp_path, monkeypatch
-) -> None:
+def test_a_disk_that_does_not_keep_up_fails_the_recording_not_the_run(tmp_path, monkeypatch):
     monkeypatch.setattr(recorder_module, "MOST_BYTES", 100)
     recorder = RunRecorder(tmp_path, metadata_of(), "Push")
     for tick in range(3):
@@ -348,9 +346,7 @@ def test_one_observation_that_a_kill_leaves_is_recovered(tmp_path, monkeypatch) 
     assert list(recording.cameras()) == ["View1"]
 
 
-def test_a_run_without_an_observation_is_no_recording_and_a_finished_one_not_recovered(
-    tmp_path,
-) -> None:
+def test_a_run_without_an_observation_is_no_recording_and_a_finished_one_not_recovered(tmp_path):
     recorder = RunRecorder(tmp_path, metadata_of(), "Push")
     with pytest.raises(RecordingError, match="the robot was never observed"):
         recorder.finish("the robot's code failed")

@@ -4,7 +4,7 @@ import http.client
 import json
 import socket
 import threading
-from collections.abc import Callable, Generator
+from collections.abc import Generator
 from contextlib import contextmanager
 from typing import Any
 
@@ -21,10 +21,6 @@ from pipeline.robot import wire
 from pipeline.robot.client import PolicyClient
 from pipeline.robot.server import PolicyServer, listen, read_token
 from pipeline.robot.server_status import ServerStatus
-
-Observe = Callable[..., dict[str, Any]]
-Serving = Callable[..., PolicyServer]
-Served = Callable[..., Any]
 
 
 def get(server: PolicyServer, path: str, **headers: str) -> tuple[int, str, dict[str, str]]:
@@ -72,7 +68,7 @@ def closing_code(bare: ClientConnection) -> int:
 
 def test_a_connection_is_one_memory_and_bit_for_bit_what_a_session_in_process_is(
     served_policy, serving, observe
-) -> None:
+):
     served = served_policy("flow_matching")
     server, here = serving(served, seed=3), served.session(seed=3)
     with client_of(server) as client, client_of(server) as other:
@@ -91,9 +87,7 @@ def test_a_connection_is_one_memory_and_bit_for_bit_what_a_session_in_process_is
         np.testing.assert_array_equal(client.infer(observe(0))["actions"], alone[0]["actions"])
 
 
-def test_observations_of_one_connection_are_answered_in_order(
-    served_policy, serving, observe
-) -> None:
+def test_observations_of_one_connection_are_answered_in_order(served_policy, serving, observe):
     with opened(serving(served_policy())) as bare:
         messages = [wire.pack(observe(tick)) for tick in range(7)]
         sending = threading.Thread(target=lambda: [bare.send(message) for message in messages])
@@ -105,7 +99,7 @@ def test_observations_of_one_connection_are_answered_in_order(
 
 def test_while_the_model_looks_healthz_answers_and_too_many_are_told_busy(
     served_policy, serving, observe
-) -> None:
+):
     """The connection stays, and has taken the readings and the reset."""
     served = served_policy()
     server = serving(served, max_waiting=1)
@@ -145,8 +139,8 @@ def array_of(dtype: str, shape: Any, data: bytes) -> dict[bytes, Any]:
     ],
 )
 def test_what_is_wrong_with_a_message_costs_its_connection_only(
-    served_policy, serving, observe, message: Any, said: str, code: int
-) -> None:
+    served_policy, serving, observe, message, said, code
+):
     server = serving(served_policy())
     with client_of(server) as good:
         good.infer(observe(0))
@@ -159,9 +153,7 @@ def test_what_is_wrong_with_a_message_costs_its_connection_only(
     assert json.loads(server.status.json())["counts"]["refused"] == 1
 
 
-def test_each_event_is_a_line_and_status_says_what_happened(
-    served_policy, serving, observe
-) -> None:
+def test_each_event_is_a_line_and_status_says_what_happened(served_policy, serving, observe):
     server: Any = serving(served_policy(), log="json")
     assert json.loads(get(server, "/status.json")[1])["latency"] == {}
     with client_of(server) as client:
@@ -236,9 +228,7 @@ def test_a_message_beyond_the_bound_is_not_read(served_policy, serving, observe)
         assert good.infer(observe(0))["actions"].shape == (4, 7)
 
 
-def test_a_bug_is_said_in_one_line_and_told_in_full_here(
-    served_policy, serving, observe, capfd
-) -> None:
+def test_a_bug_is_said_in_one_line_and_told_in_full_here(served_policy, serving, observe, capfd):
     served = served_policy()
 
     def fail(*_: Any) -> torch.Tensor:
@@ -298,8 +288,8 @@ def test_pages_of_other_places_are_refused(served_policy, serving) -> None:
     ],
 )
 def test_a_request_that_no_server_can_read_is_refused_with_a_reason(
-    served_policy, serving, path: str, headers: list[str], said: str, capfd
-) -> None:
+    served_policy, serving, path, headers, said, capfd
+):
     server = serving(served_policy(), token="s3cret")
     host, _, port = server.address.rpartition(":")
     with socket.create_connection((host, int(port)), 20) as raw, raw.makefile("rb") as answer:
@@ -309,9 +299,7 @@ def test_a_request_that_no_server_can_read_is_refused_with_a_reason(
     assert "Traceback" not in capfd.readouterr().err
 
 
-def test_stopping_answers_what_is_under_way_and_takes_no_more(
-    served_policy, serving, observe
-) -> None:
+def test_stopping_answers_what_is_under_way_and_takes_no_more(served_policy, serving, observe):
     served = served_policy()
     blocked = Blocked(served)
     server = serving(served)
@@ -365,7 +353,7 @@ def test_an_address_that_is_taken_or_somebody_elses_is_refused() -> None:
 
 def test_a_robot_counts_until_its_observation_is_answered_though_it_has_left(
     served_policy, serving, observe
-) -> None:
+):
     """Or a stranger who comes and goes would fill the memory with observations that wait."""
     served = served_policy()
     blocked = Blocked(served)

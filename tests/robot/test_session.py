@@ -2,16 +2,13 @@
 
 import threading
 from collections import deque
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
-from pipeline.base.config import RolloutParams
 from pipeline.base.errors import NumericsError, ObservationError
-from pipeline.evaluate.rollout_driver import roll_out
 from pipeline.policy.observation import moving_channels
 from pipeline.robot.loop import Executor
 from pipeline.robot.session import Session
@@ -19,8 +16,6 @@ from pipeline.simulation.environment import InsertionEnvironment
 from pipeline.simulation.insertion import INSTRUCTION
 from pipeline.simulation.rendering import VIEWS
 
-Observe = Callable[..., dict[str, Any]]
-Served = Callable[..., Any]
 SEED = 78
 BLIND: dict[str, Any] = {f"images/{view}": None for view in VIEWS}
 
@@ -41,33 +36,6 @@ def drive(session: Session) -> list[np.ndarray]:
         sent.append(executor.next_action().astype(np.float64))
         readings, reset = robot.step(sent[-1])[0], {}
     return sent
-
-
-def test_a_session_does_bit_for_bit_what_a_rollout_does(
-    phantom_policy, served_policy, monkeypatch
-) -> None:
-    """The other experts and chunkings are those of `test_over_the_wire`."""
-    sent: list[np.ndarray] = []
-    step = InsertionEnvironment.step
-
-    def watched(robot: Any, action: np.ndarray) -> Any:
-        sent.append(action.copy())
-        return step(robot, action)
-
-    checkpoint, policy, glance = phantom_policy("diffusion")
-    with monkeypatch.context() as patch:
-        patch.setattr(InsertionEnvironment, "step", watched)
-        wanted = {"episodes": 1, "seed": SEED, "ablations": (), "chunking": "none"}
-        load: Any = lambda: glance  # noqa: E731
-        rolled = roll_out(checkpoint, "head", policy, load, RolloutParams.model_validate(wanted))
-    (episode,) = rolled.of("policy")
-    assert torch.get_num_threads() == 1
-    served = served_policy("diffusion")
-    actions = drive(served.session())
-    # The demonstrator's actions came after those of the policy.
-    np.testing.assert_array_equal(actions, sent[: episode.actions])
-    assert len(actions) > 20
-    assert len(served.glance.passes) == len(glance.passes)
 
 
 def test_an_answer_says_what_it_was_made_of(served_policy, observe) -> None:
@@ -143,7 +111,7 @@ def test_a_missing_view_is_left_out_as_in_training(served_policy, observe, monke
 
 def test_without_frames_the_first_observation_is_refused_and_leaves_a_session_that_works(
     served_policy, observe
-) -> None:
+):
     session = served_policy().session()
     with pytest.raises(ObservationError, match="images/View1"):
         session.infer(observe(0, **BLIND))
@@ -250,7 +218,7 @@ def test_an_answer_that_is_no_number_is_refused(served_policy, observe, monkeypa
 
 def test_the_first_frames_and_states_of_each_episode_are_looked_at_before_the_model_looks(
     served_policy, observe
-) -> None:
+):
     class Suspicious:
         """A first look that remembers what it saw, and refuses at last."""
 

@@ -14,7 +14,7 @@ from gymnasium.utils.env_checker import check_env
 
 from pipeline.simulation.environment import InsertionEnvironment, SimulatedRobot
 from pipeline.simulation.insertion import INSERTED, MAX_TICKS, TICK_S, TIME_IS_UP
-from pipeline.simulation.rendering import VIEWS, photograph, render
+from pipeline.simulation.rendering import VIEWS, render
 from tests.simulation.environment_contract import EnvironmentContract
 
 STILL = np.zeros(7, np.float32)
@@ -79,18 +79,6 @@ def test_frames_are_those_taken_last() -> None:
     assert min(ages) >= 0 and max(ages) < 1.3 * TICK_S and np.std(ages) > 0.01
 
 
-def test_a_photograph_has_noise_and_is_the_same_again() -> None:
-    environment = InsertionEnvironment(cameras=False)
-    environment.reset(seed=2)
-    for view in VIEWS:
-        first = photograph(view, environment.insertion, 0.05)
-        np.testing.assert_array_equal(first, photograph(view, environment.insertion, 0.05))
-        again = photograph(view, environment.insertion, 0.051)
-        clean = render(view, environment.insertion.scene(0.05))
-        assert not np.array_equal(first, again)
-        assert 1 < np.std(first.astype(int) - clean.astype(int)) < 3
-
-
 def test_what_makes_no_sense_is_refused() -> None:
     wrong: Any = "hard"
     with pytest.raises(ValueError, match="depth, full, moved, found 'hard'"):
@@ -131,9 +119,7 @@ def robot(request: pytest.FixtureRequest, clock: Clock) -> Iterator[SimulatedRob
         yield made
 
 
-def test_an_action_is_a_tick_and_tells_the_readings_of_the_simulation(
-    robot: SimulatedRobot, clock: Clock
-) -> None:
+def test_an_action_is_a_tick_and_tells_the_readings_of_the_simulation(robot, clock):
     environment = InsertionEnvironment(cameras=False)
     readings, _ = environment.reset(seed=3)
     for tick in range(3):
@@ -152,9 +138,7 @@ def test_an_action_is_a_tick_and_tells_the_readings_of_the_simulation(
 
 
 @pytest.mark.parametrize(("waited", "ticks"), [(0.9, 0), (1.96, 2), (2.2, 2)])
-def test_ticks_without_an_action_pass_all_the_same(
-    robot: SimulatedRobot, clock: Clock, waited: float, ticks: int
-) -> None:
+def test_ticks_without_an_action_pass_all_the_same(robot, clock, waited, ticks):
     first = robot.observe()
     clock.now_s += waited / robot._hz
     later = robot.observe()

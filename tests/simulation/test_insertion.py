@@ -1,6 +1,5 @@
 """The physics: what is measured follows from the geometry, and stays hidden where it must."""
 
-import itertools
 from collections.abc import Iterator
 from dataclasses import replace
 
@@ -417,36 +416,3 @@ def test_the_demonstrator_never_returns_upwards_and_waits_where_it_is(distance: 
     assert min(speeds) > -0.003  # of tremor alone
     assert (np.diff(speeds) < 1e-9).all()
     assert max(-np.diff(speeds)) < 0.025  # no step of its gate
-
-
-@pytest.mark.parametrize("seed", range(2))
-def test_who_averages_the_demonstrator_arrives(seed: int, monkeypatch) -> None:
-    """An imitator that sees the target with an error of 0.45 mm an axis, anew every third tick.
-
-    It does the mean of what the demonstrator would at the places where the target may be. Imitating
-    one that returns upwards where it is not aligned, it would hover until time is up.
-    """
-    rng, looks, draws = np.random.default_rng(seed), itertools.count(), 16
-    error = np.zeros(2)
-
-    def averaged(
-        seen: Percept, speed_mm_s: float, tick_s: float, own: np.random.Generator
-    ) -> NDArray[np.float64]:
-        nonlocal error
-        if next(looks) % 3 == 0:
-            error = rng.normal(0, 0.45, 2)
-        places = seen.offset_mm + error + rng.normal(0, 0.45, (draws, 2))
-        return np.mean(
-            [
-                expert_motion(replace(seen, offset_mm=place), speed_mm_s, tick_s, own)
-                for place in places
-            ],
-            axis=0,
-        )
-
-    monkeypatch.setattr("pipeline.simulation.insertion.expert_motion", averaged)
-    insertion = NeedleInsertion()
-    insertion.reset(seed)
-    for _ in follow(insertion):
-        pass
-    assert insertion.outcome == INSERTED

@@ -29,9 +29,7 @@ def outside(distance_mm: float, layer_depth_mm: float, rows: int) -> NeedleConta
 @given(st.floats(0, 5.0), st.floats(1.5, 4.0), st.floats(0.92, 1.08), st.integers(0, 99))
 @example(4.611, 2.001, 1.0, 64)  # speckle moves the peak by 16 bins
 @example(1.0, 2.0, 1.08, 22)  # the layer saturates as the surface does
-def test_nothing_is_brighter_than_the_surface(
-    distance: float, layer_depth: float, gain: float, seed: int
-) -> None:
+def test_nothing_is_brighter_than_the_surface(distance, layer_depth, gain, seed):
     sensor = NeedleSensor(gain, seed)
     scan = sensor.a_scans(outside(distance, layer_depth, 1), NOW, np.random.default_rng(seed))[0]
     # Speckle moves the peak by at most 16 bins in 18,000 scans; its light is 14 bins wide.

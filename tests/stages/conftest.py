@@ -11,9 +11,7 @@ from typing import Any
 import pytest
 import yaml
 
-from pipeline.simulation.insertion_formats import write_raw
-from pipeline.simulation.recorder import simulate_episode
-from stages import extract, train_head
+from stages import train_head
 from stages.command import run
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -52,33 +50,20 @@ def quick_params(
 
 
 @pytest.fixture(scope="session")
-def trained_once(
-    tmp_path_factory: pytest.TempPathFactory,
-    demo_checkpoint: Path,
-    tiny_head: Callable[..., dict[str, Any]],
+def trained_tiny(
+    quick_params: Callable[[Path], dict[str, Any]], tmp_path_factory: pytest.TempPathFactory
 ) -> Path:
-    """What `trained` is a copy of."""
-    folder = tmp_path_factory.mktemp("phantom")
-    for seed in (5, 6):
-        write_raw(folder / "raw" / "task", simulate_episode(seed, 1.7e9 + 100 * seed))
-    document = {
-        "data": {"root": str(folder), "sources": [{"name": "raw", "path": "raw"}]},
-        "vlm": {
-            "checkpoint": str(demo_checkpoint),
-            "image_resize_height": 56,
-            "image_resize_width": 84,
-            "dtype": "float32",
-            "pooling": ["mean"],
-        },
-        "extract": {"store": str(folder / "store.zarr")},
-        "train_head": tiny_head(folder),
-        "rollout": {"episodes": 2, "output": str(folder / "rollout")},
-        "serve": {"port": 0, "device": "cpu"},
-    }
+    """A params.yaml whose head is trained on a tiny store."""
+    folder = tmp_path_factory.mktemp("tiny")
+    judged = {"checkpoint": str(folder / "head"), "output": str(folder / "report")}
+    alone = {"environment": None}  # no page of rollouts, to which the way would differ
+    document = quick_params(folder) | {"evaluate": judged, "rollout": alone}
+    document["export"] = {"output": str(folder / "export")}
+    # The last episode is test, and the tail of the others val.
+    document["train_head"]["split"] = {"groups": {"rest": ["*_00[0-4]"]}}
     path = folder / "params.yaml"
     path.write_text(yaml.safe_dump(document))
-    for stage in (extract, train_head):
-        assert run("", stage.main, ["--params", str(path)]) == 0
+    assert run("", train_head.main, ["--params", str(path)]) == 0
     return path
 
 

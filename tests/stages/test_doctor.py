@@ -9,8 +9,6 @@ import pytest
 import yaml
 
 from pipeline.look.doctor import GROUPS
-from pipeline.simulation.insertion_formats import write_raw
-from pipeline.simulation.recorder import simulate_episode
 from stages import doctor
 from stages.command import run
 
@@ -32,11 +30,10 @@ sys.exit(run("", doctor.main, ["--params", sys.argv[1]]))
 
 
 @pytest.fixture(scope="module")
-def params(tmp_path_factory: pytest.TempPathFactory, demo_checkpoint: Path) -> Path:
+def params(tmp_path_factory: pytest.TempPathFactory, recorded: Path, demo_checkpoint: Path) -> Path:
     tmp_path = tmp_path_factory.mktemp("doctor")
-    write_raw(tmp_path / "data" / "raw", simulate_episode(0, 1.7e9))
     document: dict[str, Any] = {
-        "data": {"root": str(tmp_path / "data"), "sources": [{"name": "raw", "path": "raw"}]},
+        "data": {"root": str(recorded.parent), "sources": [{"name": "raw", "path": "raw"}]},
         "vlm": {"checkpoint": str(demo_checkpoint), "dtype": "float32"},
         "extract": {"store": str(tmp_path / "made.zarr")},
     }

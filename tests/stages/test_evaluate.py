@@ -3,23 +3,18 @@
 import json
 import re
 import shutil
-from collections.abc import Callable
 from contextlib import redirect_stdout
 from io import StringIO
 from pathlib import Path
-from typing import Any
 
 import pytest
 import yaml
 
 from pipeline.look.page import writing
 from pipeline.look.page.blocks import Picture, Report, Text
-from pipeline.store.archive import archive
 from pipeline.store.chunks import write_seal
 from stages import evaluate, train_head
 from stages.command import run
-
-Said = pytest.CaptureFixture[str]
 
 ROOT = Path(__file__).resolve().parents[2]
 PICTURES = (
@@ -35,29 +30,12 @@ PICTURES = (
 
 
 @pytest.fixture(scope="module")
-def trained(
-    quick_params: Callable[[Path], dict[str, Any]], tmp_path_factory: pytest.TempPathFactory
-) -> Path:
-    """A params.yaml whose head is trained."""
-    folder = tmp_path_factory.mktemp("evaluate")
-    judged = {"checkpoint": str(folder / "head"), "output": str(folder / "report")}
-    alone = {"environment": None}  # no page of rollouts, to which the way would differ
-    document = quick_params(folder) | {"evaluate": judged, "rollout": alone}
-    # The last episode is test, and the tail of the others val.
-    document["train_head"]["split"] = {"groups": {"rest": ["*_00[0-4]"]}}
-    path = folder / "params.yaml"
-    path.write_text(yaml.safe_dump(document))
-    assert run("", train_head.main, ["--params", str(path)]) == 0
-    return path
-
-
-@pytest.fixture(scope="module")
-def judged(trained: Path) -> tuple[Path, str]:
+def judged(trained_tiny: Path) -> tuple[Path, str]:
     """Where its evaluation lies, whole, and what was said; not to be written to."""
     said = StringIO()
     with redirect_stdout(said):
-        assert run("", evaluate.main, ["--params", str(trained)]) == 0
-    return trained.parent / "report", said.getvalue()
+        assert run("", evaluate.main, ["--params", str(trained_tiny)]) == 0
+    return trained_tiny.parent / "report", said.getvalue()
 
 
 @pytest.fixture
@@ -73,96 +51,68 @@ def reports(monkeypatch: pytest.MonkeyPatch) -> list[Report]:
     return found
 
 
-def arguments(trained: Path, output: Path, *overrides: str) -> list[str]:
+def arguments(trained_tiny: Path, output: Path, *overrides: str) -> list[str]:
     """Of an evaluation into `output` that leaves the streams alone."""
     told = (f"evaluate.output={output}", "evaluate.modalities=false", *overrides)
-    return ["--params", str(trained), *(part for one in told for part in ("--set", one))]
+    return ["--params", str(trained_tiny), *(part for one in told for part in ("--set", one))]
 
 
 @pytest.mark.usefixtures("reports")
 def test_a_store_that_grew_is_judged_on_the_same_episodes(
-    trained: Path, judged: tuple[Path, str], tiny_store: Callable[..., Path], tmp_path: Path
-) -> None:
+    trained_tiny, judged, tiny_store, tmp_path
+):
     report, said = judged
     assert "30 test ticks of 1 episode(s)" in said
     grown = f"evaluate.store={tiny_store(tmp_path, episodes=9)}"
-    assert run("", evaluate.main, arguments(trained, tmp_path / "report", grown)) == 0
+    assert run("", evaluate.main, arguments(trained_tiny, tmp_path / "report", grown)) == 0
     assert (tmp_path / "report/judged.json").read_bytes() == (report / "judged.json").read_bytes()
-
-
-@pytest.mark.parametrize(
-    ("store", "message"),
-    [
-        ({"spec_digest": "other"}, 'feature_spec.digest: "tiny-spec" -> "other"'),
-        ({"seed": 1}, "recordings than they were: right/episode_005"),
-    ],
-)
-def test_another_store_is_refused_by_name(
-    trained: Path,
-    tiny_store: Callable[..., Path],
-    tmp_path: Path,
-    capsys: Said,
-    store: dict[str, object],
-    message: str,
-) -> None:
-    other = f"evaluate.store={tiny_store(tmp_path, name='other', **store)}"
-    assert run("", evaluate.main, ["--params", str(trained), "--set", other]) == 2
-    assert message in capsys.readouterr().err
 
 
 @pytest.mark.usefixtures("reports")
 def test_a_flipped_bit_is_refused_where_it_would_be_judged_on(
-    trained: Path,
-    tiny_store: Callable[..., Path],
-    flip: Callable[[Path, str], Path],
-    tmp_path: Path,
-    capsys: Said,
-) -> None:
+    trained_tiny, tiny_store, flip, tmp_path, capsys
+):
     store = tiny_store(tmp_path, name="flipped")
     file = flip(store, "vl/features")
-    told = arguments(trained, tmp_path / "report", f"evaluate.store={store}")
+    told = arguments(trained_tiny, tmp_path / "report", f"evaluate.store={store}")
     assert run("", evaluate.main, told) == 2
     assert f"{file}: " in capsys.readouterr().err
     assert not (tmp_path / "report").exists()
     assert run("", evaluate.main, [*told, "--set", "evaluate.check_store=false"]) == 0
 
 
-def test_what_cannot_be_evaluated_says_what_to_do(
-    trained: Path, tmp_path: Path, capsys: Said
-) -> None:
+def test_what_cannot_be_evaluated_says_what_to_do(trained_tiny, tmp_path, capsys):
     for override, message in (
         (f"evaluate.checkpoint={tmp_path / 'nowhere'}", "Run stages.train_head"),
         ("evaluate.execute=9", "evaluate.execute 9: expected at most the 8 steps"),
     ):
-        assert run("", evaluate.main, arguments(trained, tmp_path / "report", override)) == 2
+        assert run("", evaluate.main, arguments(trained_tiny, tmp_path / "report", override)) == 2
         assert message in capsys.readouterr().err
 
 
 @pytest.mark.usefixtures("reports")
 def test_without_a_checkpoint_it_judges_what_train_head_wrote(
-    trained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Said
-) -> None:
+    trained_tiny, tmp_path, monkeypatch, capsys
+):
     """Not an older head that lies where heads lie by default."""
-    shutil.copytree(trained.parent / "head", tmp_path / "models/head")
+    shutil.copytree(trained_tiny.parent / "head", tmp_path / "models/head")
     monkeypatch.chdir(tmp_path)
-    document = yaml.safe_load(trained.read_text())
+    document = yaml.safe_load(trained_tiny.read_text())
     del document["evaluate"]["checkpoint"]
     params = tmp_path / "params.yaml"
     params.write_text(yaml.safe_dump(document))
     assert run("", evaluate.main, arguments(params, tmp_path / "report")) == 0
-    assert f"{trained.parent / 'head'} (step 3)" in capsys.readouterr().out
+    assert f"{trained_tiny.parent / 'head'} (step 3)" in capsys.readouterr().out
 
 
 @pytest.mark.usefixtures("reports")
-def test_a_policy_outlives_the_renaming_of_its_source(
-    trained: Path, judged: tuple[Path, str], tmp_path: Path, capsys: Said
-) -> None:
-    renamed = Path(shutil.copytree(trained.parent / "tiny.zarr", tmp_path / "renamed.zarr"))
+def test_a_policy_outlives_the_renaming_of_its_source(trained_tiny, judged, tmp_path, capsys):
+    renamed = Path(shutil.copytree(trained_tiny.parent / "tiny.zarr", tmp_path / "renamed.zarr"))
     document = json.loads((renamed / "zarr.json").read_text())
     document["attributes"]["sources"] = ["gauche", "droite"]
     (renamed / "zarr.json").write_text(json.dumps(document))
     write_seal(renamed)
-    told = arguments(trained, tmp_path / "report", f"evaluate.store={renamed}")
+    told = arguments(trained_tiny, tmp_path / "report", f"evaluate.store={renamed}")
     assert run("", evaluate.main, told) == 0
     assert "renamed since the training" in capsys.readouterr().out
     before, after = (
@@ -172,9 +122,7 @@ def test_a_policy_outlives_the_renaming_of_its_source(
     assert after == before
 
 
-def test_the_report_says_what_was_judged_and_which_streams_are_used(
-    judged: tuple[Path, str],
-) -> None:
+def test_the_report_says_what_was_judged_and_which_streams_are_used(judged):
     """One test episode: nothing can be shuffled or drawn anew, and the report says so."""
     report, said = judged
     assert "sensor    zeroed" in said
@@ -195,10 +143,10 @@ def test_the_report_says_what_was_judged_and_which_streams_are_used(
 
 
 def test_the_same_judgement_is_the_same_bytes_wherever_it_is_written(
-    trained: Path, judged: tuple[Path, str], tmp_path: Path
-) -> None:
+    trained_tiny, judged, tmp_path
+):
     output = f"evaluate.output={tmp_path / 'else' / 'where'}"
-    assert run("", evaluate.main, ["--params", str(trained), "--set", output]) == 0
+    assert run("", evaluate.main, ["--params", str(trained_tiny), "--set", output]) == 0
     first, second = (
         {file.name: file.read_bytes() for file in folder.iterdir()}
         for folder in (judged[0], tmp_path / "else" / "where")
@@ -206,27 +154,23 @@ def test_the_same_judgement_is_the_same_bytes_wherever_it_is_written(
     assert first == second and "report.html" in first
 
 
-def test_a_report_says_that_the_logs_are_gone(
-    trained: Path, tmp_path: Path, reports: list[Report]
-) -> None:
-    logs = shutil.move(trained.parent / "logs", tmp_path / "logs")
+def test_a_report_says_that_the_logs_are_gone(trained_tiny, tmp_path, reports):
+    logs = shutil.move(trained_tiny.parent / "logs", tmp_path / "logs")
     try:
-        assert run("", evaluate.main, arguments(trained, tmp_path / "report")) == 0
+        assert run("", evaluate.main, arguments(trained_tiny, tmp_path / "report")) == 0
     finally:
-        shutil.move(logs, trained.parent / "logs")
+        shutil.move(logs, trained_tiny.parent / "logs")
     (report,) = reports
-    gone = f"there are none in {trained.parent / 'logs/plots/metrics'} any more"
+    gone = f"there are none in {trained_tiny.parent / 'logs/plots/metrics'} any more"
     assert any(gone in text.words for text in report.blocks(Text))
     assert "curves" not in {picture.name for picture in report.blocks(Picture)}
 
 
-def test_streams_are_left_alone_where_nobody_asks(
-    trained: Path, tmp_path: Path, reports: list[Report]
-) -> None:
+def test_streams_are_left_alone_where_nobody_asks(trained_tiny, tmp_path, reports):
     """DVC misses no file of such an evaluation either."""
     listed = re.findall(r"evaluate\.output}/([\w.]+)", (ROOT / "dvc.yaml").read_text())
     output = tmp_path / "report"
-    assert run("", evaluate.main, arguments(trained, output)) == 0
+    assert run("", evaluate.main, arguments(trained_tiny, output)) == 0
     pictures = {f"{picture.name}.png" for picture in reports[0].blocks(Picture)}
     assert len(listed) > 8 and set(listed) <= pictures | {file.name for file in output.iterdir()}
     assert "modalities.png" not in pictures
@@ -234,7 +178,7 @@ def test_streams_are_left_alone_where_nobody_asks(
 
 
 @pytest.mark.usefixtures("reports")
-def test_a_sampling_policy_is_judged_on_one_sample(trained: Path, tmp_path: Path) -> None:
+def test_a_sampling_policy_is_judged_on_one_sample(trained_tiny: Path, tmp_path: Path) -> None:
     head = tmp_path / "head"
     own = (
         "train_head.model_type=flow_matching",
@@ -243,10 +187,10 @@ def test_a_sampling_policy_is_judged_on_one_sample(trained: Path, tmp_path: Path
         f"evaluate.checkpoint={head}",
     )
     output = tmp_path / "report"
-    assert run("", train_head.main, arguments(trained, output, *own)) == 0
+    assert run("", train_head.main, arguments(trained_tiny, output, *own)) == 0
     found = []
     for samples in (1, 8):
-        told = arguments(trained, output, *own, f"evaluate.samples={samples}")
+        told = arguments(trained_tiny, output, *own, f"evaluate.samples={samples}")
         assert run("", evaluate.main, told) == 0
         document = json.loads((output / "judged.json").read_text())
         assert document["policy"]["samples"] == samples
@@ -261,8 +205,8 @@ def test_a_sampling_policy_is_judged_on_one_sample(trained: Path, tmp_path: Path
 
 
 def test_the_rollouts_of_this_policy_are_linked_though_they_come_later(
-    trained: Path, tmp_path: Path, reports: list[Report]
-) -> None:
+    trained_tiny, tmp_path, reports
+):
     for checkpoint in ("null", "models/another"):
         rollout = {
             "environment": "phantom",
@@ -270,15 +214,6 @@ def test_the_rollouts_of_this_policy_are_linked_though_they_come_later(
             "output": tmp_path / "rollout",
         }
         overrides = [f"rollout.{key}={value}" for key, value in rollout.items()]
-        assert run("", evaluate.main, arguments(trained, tmp_path / "report", *overrides)) == 0
+        assert run("", evaluate.main, arguments(trained_tiny, tmp_path / "report", *overrides)) == 0
     pages = [{text.page for text in report.blocks(Text)} - {""} for report in reports]
     assert pages == [{"../rollout/report.html"}, set()]
-
-
-def test_an_archive_has_to_be_restored_first(trained: Path, tmp_path: Path, capsys: Said) -> None:
-    packed = tmp_path / "tiny.archive.zarr"
-    archive(trained.parent / "tiny.zarr", packed, level=1, threads=1)
-    told = arguments(trained, tmp_path / "report", f"extract.store={packed}")
-    for command in (train_head.main, evaluate.main):
-        assert run("", command, told) == 2
-        assert "stages.archive --restore" in capsys.readouterr().err

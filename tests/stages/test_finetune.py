@@ -2,7 +2,6 @@
 
 import json
 import shlex
-import subprocess
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -17,7 +16,6 @@ from tests.train.finetuning.conftest import write_episode
 Said = pytest.CaptureFixture[str]
 Make = Callable[..., Any]
 
-Start = Callable[..., "subprocess.Popen[str]"]
 HELD = """
 import sys, time
 from pipeline.train.loop import Trainer
@@ -90,13 +88,7 @@ def write_params(extracted: Path, tmp_path: Path) -> Make:
     return write
 
 
-def test_a_flipped_bit_is_refused_before_tuning(
-    write_params: Make,
-    extracted: Path,
-    flip: Callable[[Path, str], Path],
-    tmp_path: Path,
-    capsys: Said,
-) -> None:
+def test_a_flipped_bit_is_refused_before_tuning(write_params, extracted, flip, tmp_path, capsys):
     store = extracted.parent / "made.zarr"
     file = flip(store, "tick/action")
     try:
@@ -108,8 +100,9 @@ def test_a_flipped_bit_is_refused_before_tuning(
 
 
 def test_it_tunes_and_says_how_to_go_on_and_that_works(
-    write_params: Make, extracted: Path, tmp_path: Path, capsys: Said
-) -> None:
+    write_params, extracted, tmp_path, capsys, monkeypatch
+):
+    monkeypatch.setattr("pipeline.look.page.writing.write_report", lambda *_: [])
     params, seed = str(write_params()), "train_head.seed=1"
     assert run("", finetune.main, ["--params", params, "--set", seed]) == 0
     captured = capsys.readouterr()
@@ -157,8 +150,8 @@ def test_it_tunes_and_says_how_to_go_on_and_that_works(
 
 @pytest.mark.slow
 def test_killed_in_mid_run_it_ends_where_an_undisturbed_run_ends(
-    started_until: Start, write_params: Make, tmp_path: Path, capsys: Said
-) -> None:
+    started_until, write_params, tmp_path, capsys
+):
     process = started_until(HELD, write_params("killed"), "holding")
     assert run("", finetune.main, ["--params", str(write_params("killed"))]) == 2
     assert "being built by process" in capsys.readouterr().err

@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import zarr
 
 from pipeline.base.errors import Issue
 from pipeline.look.page.blocks import Issues, Report, Section
@@ -37,9 +36,7 @@ def looked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, demo_checkpoint: Pat
     return look
 
 
-def test_recordings_and_a_damaged_one_are_a_page(
-    looked: Make, recorded: Path, tmp_path: Path, capsys: Said
-) -> None:
+def test_recordings_and_a_damaged_one_are_a_page(looked, recorded, tmp_path, capsys):
     (episode,) = recorded.iterdir()
     for name in ("sound", "broken"):
         shutil.copytree(episode, tmp_path / "lab" / name)
@@ -57,9 +54,7 @@ def test_recordings_and_a_damaged_one_are_a_page(
     assert page.is_file() and len(list(page.parent.glob("*.png"))) >= 3
 
 
-def test_a_path_needs_no_params_file(
-    recorded: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Said
-) -> None:
+def test_a_path_needs_no_params_file(recorded, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     assert run("", inspect.main, [str(recorded)], shorthands=inspect.SHORTHANDS) == 0
     out = capsys.readouterr().out
@@ -70,20 +65,9 @@ def test_a_path_needs_no_params_file(
         assert ".yaml: no such file. Run from the project's root" in capsys.readouterr().err
 
 
-def test_a_zarr_group_of_somebody_else_is_named_and_not_to_be_replaced(
-    looked: Make, tmp_path: Path, capsys: Said
-) -> None:
-    group = zarr.create_group(tmp_path / "umi.zarr", zarr_format=2)
-    group.create_array("data/action", shape=(3,), dtype="f4")
-    assert looked("umi.zarr") == 2
-    err = capsys.readouterr().err
-    assert "umi.zarr" in err and "It looks like a zarr replay buffer" in err
-    assert "extract.store=" not in err
-
-
 def test_a_korean_name_lacks_a_font_and_grey_frames_of_16_bits_are_not_white(
-    looked: Make, tmp_path: Path, capsys: Said, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    looked, tmp_path, capsys, monkeypatch
+):
     """Where a warning a letter came through, it would be an error here."""
     episode = write_raw(tmp_path / "바늘_삽입", Truth(), views=("View1",))
     for number, frame in enumerate(sorted(episode.rglob("*.jpg"))):
@@ -104,27 +88,6 @@ def test_a_store_is_a_page(looked: Make, tiny_store: Make, tmp_path: Path, capsy
     assert looked(store, "--set", "inspect.output=mine") == 0
     assert "Store: tiny.zarr\nepisodes 6 · " in capsys.readouterr().out
     assert (tmp_path / "mine/report.html").is_file()
-
-
-def test_what_cannot_be_inspected_is_refused(
-    looked: Make, tiny_store: Make, tmp_path: Path, capsys: Said
-) -> None:
-    from pipeline.store.archive import archive
-
-    (tmp_path / "empty").mkdir()
-    store = tiny_store(tmp_path)
-    archive(store, tmp_path / "copy.zarr", 1, 1)
-    store.rename(tmp_path / "tiny.zarr.part")
-    for place, message in (
-        ("nowhere", "expected a folder, found nothing at nowhere"),
-        ("empty", "Mend the path or format"),
-        ("tiny.zarr.part", "stages.extract"),
-        ("copy.zarr", "--restore"),
-    ):
-        assert looked(place) == 2
-        error = capsys.readouterr().err
-        assert error.startswith("error: ") and message in error
-    assert not (tmp_path / "reports").exists()
 
 
 def test_the_summary_says_the_worst_first_and_how_much_more_there_is() -> None:

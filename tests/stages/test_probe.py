@@ -99,12 +99,7 @@ def test_the_same_again_gives_the_same_bytes_and_leaves_the_store(params: Path) 
     FeatureStore.open(store)
 
 
-def test_what_cannot_be_probed_is_said(
-    params: Path,
-    tiny_store: Callable[..., Path],
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_what_cannot_be_probed_is_said(params, tiny_store, tmp_path, capsys):
     lonely = tiny_store(tmp_path, name="lonely", episodes=1)
     arguments = ["--params", str(params), "--set", f"probe.store={lonely}"]
     assert run("", probe.main, arguments) == 2
@@ -114,12 +109,7 @@ def test_what_cannot_be_probed_is_said(
     assert not (params.parent / "report").exists()
 
 
-def test_a_damaged_store_is_refused(
-    params: Path,
-    tiny_store: Callable[..., Path],
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_a_damaged_store_is_refused(params, tiny_store, tmp_path, capsys):
     store = tiny_store(tmp_path, name="sound", episodes=6)
     arguments = ["--params", str(params), "--set", f"probe.store={store}"]
     checked = [*arguments, "--set", "probe.check_store=true"]

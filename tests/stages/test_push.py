@@ -2,7 +2,7 @@
 
 import base64
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from threading import Thread
@@ -83,9 +83,7 @@ def hub() -> Iterator[Hub]:
         thread.join()
 
 
-def test_a_judged_policy_is_uploaded_with_its_own_figures(
-    trained: Path, hub: Hub, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_judged_policy_is_uploaded_with_its_own_figures(trained, hub, tmp_path, monkeypatch):
     # Pages, whose pictures take most of the time, are not uploaded.
     monkeypatch.setattr("pipeline.look.page.writing.write_report", lambda *_: [])
     set_ = [f"evaluate.output={tmp_path / 'evaluate'}", "evaluate.modalities=false"]
@@ -124,9 +122,7 @@ def test_a_store_comes_back_as_it_was(trained: Path, hub: Hub, tmp_path: Path) -
     assert FeatureStore.open(tmp_path / "back").spec == FeatureStore.open(store).spec
 
 
-def test_a_stream_that_is_not_there_is_said_to_be_none(
-    tiny_store: Callable[..., Path], tmp_path: Path
-) -> None:
+def test_a_stream_that_is_not_there_is_said_to_be_none(tiny_store, tmp_path):
     card = store_card(FeatureStore.open(tiny_store(tmp_path, sensor_channels=0)), "lab/store")
     assert "| sensor | none |" in card and "| state | joint_0, joint_1" in card
 
@@ -139,9 +135,7 @@ def test_the_card_alone_uploads_nothing(trained: Path, hub: Hub) -> None:
     assert hub.made == [] and hub.repos == {}
 
 
-def test_what_the_hub_refuses_and_what_cannot_be_pushed(
-    trained: Path, hub: Hub, tmp_path: Path
-) -> None:
+def test_what_the_hub_refuses_and_what_cannot_be_pushed(trained, hub, tmp_path):
     hub.public = True
     with pytest.raises(HubError, match="is there and public"):
         push(load_params(trained, ["push.repo=lab/needle"]), hub.api)

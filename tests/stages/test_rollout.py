@@ -1,7 +1,6 @@
 """The command runs a checkpoint in the phantom, or says why it cannot."""
 
 import json
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -20,8 +19,8 @@ def arguments(trained: Path, **changed: Any) -> list[str]:
 
 
 def test_it_writes_metrics_table_and_page_the_same_every_time(
-    trained: Path, tmp_path: Path, capsys: Said, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    trained, tmp_path, capsys, monkeypatch
+):
     for output in ("first", "second"):
         told = arguments(trained, output=tmp_path / output, episodes=1, ablations='["sensor off"]')
         assert run("", rollout.main, told) == 0
@@ -55,9 +54,7 @@ def test_what_cannot_be_run_is_refused_by_name(trained: Path, capsys: Said) -> N
     assert not (trained.parent / "rollout").exists()
 
 
-def test_a_policy_of_another_robot_is_refused(
-    quick_params: Callable[[Path], dict[str, Any]], tmp_path: Path, capsys: Said
-) -> None:
+def test_a_policy_of_another_robot_is_refused(quick_params, tmp_path, capsys):
     path = tmp_path / "params.yaml"
     path.write_text(yaml.safe_dump(quick_params(tmp_path)))
     assert run("", train_head.main, ["--params", str(path)]) == 0
@@ -70,9 +67,7 @@ def test_a_policy_of_another_robot_is_refused(
     assert json.loads((tmp_path / "none" / "metrics.json").read_text()) == {"success": {}}
 
 
-def test_a_folder_of_somebody_else_is_left_alone(
-    trained: Path, tmp_path: Path, capsys: Said
-) -> None:
+def test_a_folder_of_somebody_else_is_left_alone(trained, tmp_path, capsys):
     (tmp_path / "thesis.txt").write_text("all of it")
     assert run("", rollout.main, arguments(trained, output=tmp_path)) == 2
     assert "thesis.txt" in capsys.readouterr().err

@@ -72,9 +72,7 @@ def observe_phantom() -> dict[str, Any]:
     return robot.reset(seed=3)[0] | {"prompt": "Insert"}
 
 
-def test_what_cannot_be_served_is_refused_by_name(
-    trained: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_cannot_be_served_is_refused_by_name(trained, monkeypatch, capsys):
     monkeypatch.delenv("VLA_SERVE_TOKEN", raising=False)
     for override, message in (
         ("serve.checkpoint=nowhere", "expected a checkpoint"),

@@ -15,10 +15,6 @@ from stages import store as stage
 from stages import train_head
 from stages.command import run
 
-Said = pytest.CaptureFixture[str]
-
-Make = Callable[..., Path]
-
 
 @pytest.fixture
 def params(tiny_head: Callable[..., dict[str, Any]], tmp_path: Path) -> Path:
@@ -43,9 +39,7 @@ def command(params: Path, *arguments: str) -> int:
     return run("", stage.main, ["--params", str(params), *arguments], stage.SHORTHANDS)
 
 
-def test_list_names_what_was_trained_on_a_store(
-    params: Path, tiny_store: Make, tmp_path: Path, capsys: Said
-) -> None:
+def test_list_names_what_was_trained_on_a_store(params, tiny_store, tmp_path, capsys):
     stores = tmp_path / "stores"
     tiny_store(stores, name="one")
     tiny_store(stores, name="two", seed=1)
@@ -76,9 +70,7 @@ def test_list_names_what_was_trained_on_a_store(
     assert "broken/run.json" in said.err
 
 
-def test_merge_gives_a_store_that_trains(
-    params: Path, tiny_store: Make, tmp_path: Path, capsys: Said
-) -> None:
+def test_merge_gives_a_store_that_trains(params, tiny_store, tmp_path, capsys):
     a, b = (str(tiny_store(tmp_path, name=name, seed=seed)) for seed, name in enumerate("ab"))
     into = tmp_path / "stores" / "one.zarr"
     assert command(params, "merge", a, b, "--into", str(into)) == 0
@@ -90,9 +82,7 @@ def test_merge_gives_a_store_that_trains(
     assert "up to date, nothing to do" in capsys.readouterr().out
 
 
-def test_mistakes_end_in_one_message(
-    params: Path, tiny_store: Make, tmp_path: Path, capsys: Said
-) -> None:
+def test_mistakes_end_in_one_message(params, tiny_store, tmp_path, capsys):
     a = str(tiny_store(tmp_path, name="a"))
     other = str(tiny_store(tmp_path, name="b", reuse=2))
     into = ["--into", str(tmp_path / "c.zarr")]
@@ -112,9 +102,7 @@ def test_mistakes_end_in_one_message(
         assert said in err
 
 
-def test_gc_lists_and_removes_only_when_told_to(
-    params: Path, tiny_store: Make, tmp_path: Path, capsys: Said
-) -> None:
+def test_gc_lists_and_removes_only_when_told_to(params, tiny_store, tmp_path, capsys):
     stores = tmp_path / "stores"
     tiny_store(stores, name="one")
     tiny_store(stores, name="two").rename(stores / "two.zarr.part")

@@ -2,7 +2,6 @@
 
 import json
 import os
-import shutil
 import signal
 import subprocess
 import sys
@@ -20,7 +19,6 @@ from stages.command import run
 Said = pytest.CaptureFixture[str]
 Make = Callable[..., Any]
 
-Start = Callable[..., "subprocess.Popen[str]"]
 WITHOUT_VLM = """
 import sys
 
@@ -106,8 +104,8 @@ def write_params(
 
 
 def test_a_logger_that_is_not_installed_is_named_before_the_store_is_opened(
-    write_params: Make, monkeypatch: pytest.MonkeyPatch, capsys: Said
-) -> None:
+    write_params, monkeypatch, capsys
+):
     monkeypatch.setattr("pipeline.train.log._MODULES", {"wandb": "no_such_module"})
     path = write_params(loggers=["wandb"])
     arguments = ["--params", str(path), "--set", "extract.store=/no/such.zarr"]
@@ -116,9 +114,7 @@ def test_a_logger_that_is_not_installed_is_named_before_the_store_is_opened(
     assert "cannot load the package of wandb (No module named 'no_such_module')" in said
 
 
-def test_it_trains_evaluates_and_then_has_nothing_to_do(
-    started: Start, write_params: Make, tmp_path: Path
-) -> None:
+def test_it_trains_evaluates_and_then_has_nothing_to_do(started, write_params, tmp_path):
     """With neither transformers nor peft, and silent where there is no terminal."""
     params = write_params(
         store={"sensor_channels": 0, "episodes": 4, "ticks": 12}, robot_state_enabled=False
@@ -149,9 +145,7 @@ def test_it_trains_evaluates_and_then_has_nothing_to_do(
     assert error != best["metrics"]["val/error"], "val chose, test reports"
 
 
-def test_two_runs_do_not_write_their_curves_into_one_folder(
-    write_params: Make, tmp_path: Path, capsys: Said
-) -> None:
+def test_two_runs_do_not_write_their_curves_into_one_folder(write_params, tmp_path, capsys):
     params, logs = write_params(max_steps=2, store={"episodes": 3, "ticks": 12}), tmp_path / "logs"
     arguments = ["--params", str(params), "--set", f"train_head.logs={logs}"]
     with build_lock(logs):  # as another run holds it, to another output
@@ -162,38 +156,8 @@ def test_two_runs_do_not_write_their_curves_into_one_folder(
     assert run("", train_head.main, arguments) == 0, "the same run goes on"
 
 
-@pytest.mark.slow  # as tests/faults/test_kills.py kills it, without the stage's process
-def test_killed_in_mid_run_it_ends_where_an_undisturbed_run_ends(
-    started_until: Start, write_params: Make, tmp_path: Path, capsys: Said
-) -> None:
-    undisturbed, killed = write_params("undisturbed"), write_params("killed")
-    process = started_until(HELD.format(step=18), killed, "holding")
-    try:
-        assert run("", train_head.main, ["--params", str(killed)]) == 2
-        assert "being built by process" in capsys.readouterr().err
-    finally:
-        process.kill()
-        process.communicate()
-    part = tmp_path / "killed/head.part"
-    assert (part / "last/policy.json").exists()
-    assert not (tmp_path / "killed/head").exists()
-    for params in (undisturbed, killed):
-        assert run("", train_head.main, ["--params", str(params)]) == 0
-    out = capsys.readouterr().out
-    assert "resuming the run in" in out
-    assert "steps 16 to 30" in out
-    for name in ("best", "last"):
-        files = [
-            tmp_path / run / "head" / name / "policy.safetensors"
-            for run in ("undisturbed", "killed")
-        ]
-        assert files[0].read_bytes() == files[1].read_bytes()
-
-
 @pytest.mark.slow
-def test_a_sigterm_leaves_the_step_it_came_in(
-    started_until: Start, write_params: Make, tmp_path: Path
-) -> None:
+def test_a_sigterm_leaves_the_step_it_came_in(started_until, write_params, tmp_path):
     params = write_params(checkpoint_every=1000)
     process = started_until(HELD.format(step=6), params, "holding")
     process.send_signal(signal.SIGTERM)
@@ -220,8 +184,8 @@ def test_mistakes_end_in_one_message(write_params: Make, tmp_path: Path, capsys:
 
 
 def test_a_flipped_bit_is_refused_where_it_would_be_learnt_from(
-    write_params: Make, flip: Callable[[Path, str], Path], tmp_path: Path, capsys: Said
-) -> None:
+    write_params, flip, tmp_path, capsys
+):
     arguments = ["--params", str(write_params(max_steps=3))]
     file = flip(tmp_path / "params.zarr", "sensor/values")
     assert run("", train_head.main, arguments) == 2
@@ -235,16 +199,3 @@ def test_a_flipped_bit_is_refused_where_it_would_be_learnt_from(
     # A finished run reads no number of the store, and is the same run with the check as without.
     assert run("", train_head.main, arguments) == 0
     assert "nothing to do" in capsys.readouterr().out
-
-
-def test_features_of_another_store_are_refused_although_they_give_their_checksums(
-    write_params: Make, tiny_store: Make, tmp_path: Path, capsys: Said
-) -> None:
-    arguments = ["--params", str(write_params(max_steps=3))]
-    store, other = tmp_path / "params.zarr", tiny_store(tmp_path, name="other", seed=9)
-    shutil.copytree(other / "vl/features/c", store / "vl/features/c", dirs_exist_ok=True)
-    shutil.copytree(other / "vl/checksum/c", store / "vl/checksum/c", dirs_exist_ok=True)
-    assert run("", train_head.main, arguments) == 2
-    error = capsys.readouterr().err
-    assert f"{store}/vl/features/c/0/0/0: " in error
-    assert "stages.verify --repair" in error

@@ -2,9 +2,7 @@
 
 import json
 import time
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -12,9 +10,7 @@ from pipeline.look.page.blocks import Report, Section, Text
 from pipeline.look.page.writing import write_report
 
 
-def test_a_browser_finds_every_block_sound(
-    every_page: Path, assert_page_is_sound: Callable[[Path], None]
-) -> None:
+def test_a_browser_finds_every_block_sound(every_page, assert_page_is_sound):
     assert_page_is_sound(every_page)
 
 
@@ -28,9 +24,7 @@ PLANTED = (
 
 
 @pytest.mark.parametrize("guarded", [True, pytest.param(False, marks=pytest.mark.slow)])
-def test_a_page_that_asks_for_anything_is_not_sound(
-    guarded: bool, tmp_path: Path, browser_page: Callable[..., Any]
-) -> None:
+def test_a_page_that_asks_for_anything_is_not_sound(guarded, tmp_path, browser_page):
     sound = Report("Sound", "", sections=[Section("All", [Text("words")])])
     page = write_report(tmp_path, sound)[0]
     assert browser_page(page).trouble == []
@@ -74,9 +68,7 @@ Object.defineProperty(window, "kept", { value: kept });
 
 
 @pytest.mark.slow
-def test_light_and_dark_can_be_chosen_and_are_remembered(
-    every_page: Path, browser_page: Callable[..., Any]
-) -> None:
+def test_light_and_dark_can_be_chosen_and_are_remembered(every_page, browser_page):
     chosen = "() => document.documentElement.dataset.theme"
     first = browser_page(every_page, script=STORAGE % ("{}", ""))
     first.page.locator("#theme").click()
@@ -92,9 +84,7 @@ def test_light_and_dark_can_be_chosen_and_are_remembered(
 
 
 @pytest.mark.slow
-def test_without_scripts_and_on_paper_all_is_there(
-    every_page: Path, browser_page: Callable[..., Any]
-) -> None:
+def test_without_scripts_and_on_paper_all_is_there(every_page, browser_page):
     still = browser_page(every_page, java_script_enabled=False).page
     assert still.locator("figure svg").count() == 2
     assert still.locator("#picture-one svg").is_visible()
@@ -117,9 +107,7 @@ def test_the_contents_are_folded_on_a_phone_only(every_page: Path, browser_page)
 
 
 @pytest.mark.slow
-def test_the_contents_scroll_to_where_the_reader_is(
-    tmp_path: Path, browser_page: Callable[..., Any]
-) -> None:
+def test_the_contents_scroll_to_where_the_reader_is(tmp_path, browser_page):
     said = [Section(f"Part {index}", [Text("word " * 2000)]) for index in range(60)]
     page = browser_page(write_report(tmp_path, Report("Long", "", sections=said))[0]).page
     page.evaluate("document.getElementById('part-50').scrollIntoView()")

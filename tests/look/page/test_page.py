@@ -34,9 +34,7 @@ def pictures(*names: str, draw: Callable[[], Figure] = lambda: canvas(2, 2)) -> 
     return Report("Pictures", "", sections=[Section("All", blocks)])
 
 
-def test_the_same_report_gives_the_same_bytes(
-    every_block: Report, every_page: Path, tmp_path: Path
-) -> None:
+def test_the_same_report_gives_the_same_bytes(every_block, every_page, tmp_path):
     files = write_report(tmp_path, every_block)
     names = [file.name for file in files]
     assert names == [PAGE, "one.png", "two.png", "findings.csv"]

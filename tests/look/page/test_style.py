@@ -1,7 +1,6 @@
 """What every picture shares: words as they are written, whatever is in them."""
 
 import warnings
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -22,9 +21,7 @@ def test_axes_of_powers_of_ten_say_plain_numbers() -> None:
     assert not any("$" in one for one in said)
 
 
-def test_letters_without_a_font_are_said_once_and_other_warnings_go_on(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_letters_without_a_font_are_said_once_and_other_warnings_go_on(tmp_path, monkeypatch):
     def drawn() -> Figure:
         figure = style.canvas(2, 1)
         figure.text(0, 0, "바늘 삽입")

@@ -52,10 +52,11 @@ def healthy(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def write_all(root: Path) -> None:
-    write_raw(root / "raw" / "Red_point", simulate_episode(23, EPOCH_S))
-    write_new(root / "new" / "Red_point", simulate_episode(23, EPOCH_S), ABUTTING, robot_clock=True)
-    write_old(root / "old" / "Red_point", simulate_episode(23, EPOCH_S))
-    write_lerobot(root / "lerobot", iter([simulate_episode(23, EPOCH_S)]))
+    episode = simulate_episode(23, EPOCH_S)
+    write_raw(root / "raw" / "Red_point", episode)
+    write_new(root / "new" / "Red_point", episode, ABUTTING, robot_clock=True)
+    write_old(root / "old" / "Red_point", episode)
+    write_lerobot(root / "lerobot", iter([episode]))
 
 
 @pytest.fixture

@@ -1,35 +1,20 @@
-"""Rates, jitter and gaps of a clock."""
+"""Rates, jitter and gaps of a clock; clocks that were set, and streams and frames that lack."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from pipeline.look.recording.clocks import Clock, Gap, read_clocks, usual_step
+from pipeline.base.errors import Issue
+from pipeline.look.recording.clocks import Clock, Gap, find_clock_issues, usual_step
 from pipeline.look.recording.episode import EpisodeView
 
 
 def gaps(time: np.ndarray) -> tuple[Gap, ...]:
     return Clock("sensor", "stream", time).gaps
-
-
-@pytest.mark.parametrize("format", ["raw", "new", "old", "lerobot"])
-def test_every_clock_of_a_recording(healthy: Path, look: Callable[..., EpisodeView], format: str):
-    view = look(healthy / format)
-    assert view.timeline is not None
-    found = {clock.name: clock for clock in read_clocks(view)}
-    views = {"view View1", "view View2", "view View5"}
-    assert set(found) == views | {"ticks", "VL rows"} | view.streams.keys()
-    assert found["ticks"].kind == "tick" and found["VL rows"].kind == "vl_row"
-    assert found["view View1"].kind == "camera" and found["sensor"].kind == "stream"
-    assert found["ticks"].rate_hz == pytest.approx(10)
-    assert found["VL rows"].rate_hz == pytest.approx(10 / 3)
-    assert found["ticks"].mean_rate_hz == pytest.approx(10)
-    assert found["view View2"].mean_rate_hz <= found["view View2"].rate_hz * 1.01
-    assert found["sensor"].rate_hz == pytest.approx(10 if format == "old" else 650, rel=0.01)
-    # The simulated raw recorder loses five rows of the robot's in every episode.
-    assert len(found["state"].gaps) == (format == "raw")
 
 
 def test_one_lost_entry_is_no_gap_and_two_are() -> None:
@@ -67,3 +52,99 @@ def test_a_clock_that_only_repeats_has_no_gap() -> None:
 def test_short_clocks_have_no_rate() -> None:
     assert np.isnan(usual_step(np.array([3.0])))
     assert gaps(np.array([3.0, 9.0])) == ()
+
+
+FAST = np.arange(39000) / 650
+SLOW = np.arange(6000) / 100
+CAMERA = np.arange(600) / 10
+Find = Callable[[Mapping[str, np.ndarray]], tuple[Issue, ...]]
+
+
+def set_by(time: np.ndarray, seconds: float, at: float = 30) -> np.ndarray:
+    return time + seconds * (time >= at)
+
+
+def without(time: np.ndarray, start: float, stop: float) -> np.ndarray:
+    return time[(time < start) | (time >= stop)]
+
+
+@pytest.fixture
+def find(healthy: Path, look: Callable[..., EpisodeView]) -> Find:
+    """`find({"sensor": time, "view View1": time})`: clock issues of streams with these times."""
+    view = look(healthy / "raw")
+
+    def issues(clocks: Mapping[str, np.ndarray]) -> tuple[Issue, ...]:
+        streams = {
+            name: replace(stream, time=clocks[name])
+            for name, stream in view.streams.items()
+            if name in clocks
+        }
+        cameras = {
+            name.removeprefix("view "): SimpleNamespace(time=time)
+            for name, time in clocks.items()
+            if name.startswith("view ")
+        }
+        absent = {"sensor": None, "state": None, "poses": None, "action": None}
+        one = replace(view, timeline=None, cameras=cameras, zero=0.0, **absent | streams)
+        return tuple(find_clock_issues(one))
+
+    return issues
+
+
+def test_a_clock_that_was_set_is_a_gap_of_that_clock_alone(find: Find) -> None:
+    (issue,) = find({"sensor": set_by(FAST, 5.0), "state": SLOW})
+    assert (issue.kind, issue.stream) == ("gap", "sensor")
+    assert issue.start_s == pytest.approx(30, abs=0.01)
+    late = {f"view View{place}": set_by(CAMERA + 0.03 * place, 5) for place in (1, 2, 5)}
+    found = find({"sensor": FAST, "state": SLOW, **late})
+    assert [issue.kind for issue in found] == ["gap"] * 3
+
+
+def test_a_stream_that_lacks_entries_has_a_gap_however_long(find: Find) -> None:
+    (issue,) = find({"sensor": without(FAST, 10, 55), "state": SLOW})
+    assert (issue.kind, issue.stream) == ("gap", "sensor")
+    asleep = {"sensor": set_by(FAST[:9685], 15, at=10), "state": set_by(SLOW[:1510], 15, at=10)}
+    assert {issue.kind for issue in find(asleep)} == {"gap"}, "where all pause none loses ticks"
+
+
+def test_a_stream_that_ends_early(find: Find) -> None:
+    (early,) = find({"sensor": FAST, "state": SLOW[:4000]})
+    assert (early.kind, early.stream) == ("lost ticks", "state")
+    assert "ends 20.01 s before most others" in early.message
+    found = find({"sensor": set_by(FAST, 5), "state": SLOW[:4000], "view View1": CAMERA})
+    kinds = [(issue.kind, issue.stream) for issue in found]
+    assert kinds == [("gap", "sensor"), ("lost ticks", "state")]
+    assert "ends 19.91 s before most others" in found[1].message
+
+
+@pytest.mark.parametrize("start", [0.3, -0.3])
+def test_what_a_late_or_early_stream_costs_is_judged_by_the_episode(find, start):
+    """Three of 32 ticks are a tenth of what there is to learn from."""
+    short = {name: time[time < 3.2] for name, time in (("sensor", FAST), ("state", SLOW))}
+    time = short["sensor"]
+    kept = time >= start if start > 0 else time < 3.2 + start
+    (issue,) = find(short | {"sensor": time[kept]})
+    assert (issue.kind, issue.stream) == ("lost ticks", "sensor")
+    assert "about 3 ticks, 9 %" in issue.message
+    long = {"sensor": FAST[200:], "state": SLOW}
+    assert find(long) == ()
+
+
+def test_a_slow_camera_of_a_short_episode_loses_nothing(find: Find) -> None:
+    time = np.arange(16) / 5 + 0.1
+    assert find({"sensor": FAST[:2080], "state": SLOW[:320], "view View1": time[time < 2.95]}) == ()
+
+
+def test_frames_that_are_lost_have_a_place(find: Find) -> None:
+    burst = np.arange(200, 240, 2)
+    (issue,) = find({"view View1": np.delete(CAMERA, [5, *burst, *range(300, 600, 30)])})
+    assert issue.kind == "dropped frames"
+    assert issue.start_s is not None and issue.stop_s is not None
+    assert (issue.start_s, issue.stop_s) == pytest.approx((0.4, 57.1))
+
+
+def test_times_that_repeat_are_told(find: Find) -> None:
+    time = np.arange(0, 30, 0.01)
+    (issue,) = find({"sensor": np.repeat(time[::2], 2), "state": time})
+    assert (issue.kind, issue.stream) == ("repeated times", "sensor")
+    assert issue.message == "1500 of 3000 entries have the time of the entry before"

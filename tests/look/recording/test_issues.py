@@ -202,16 +202,14 @@ class TestCameras:
         ],
     )
     def test_a_stream_that_the_metadata_promise(
-        self, copied: Copied, issues_of: Find, format: str, file: str, stream: str, said: str
-    ) -> None:
+        self, copied, issues_of, format, file, stream, said
+    ):
         folder = copied(format)
         (folder / file).unlink()
         (issue,) = [issue for issue in issues_of(folder) if issue.kind == "missing"]
         assert issue.stream == stream and said in issue.message
 
-    def test_a_rate_promises_a_stream_and_a_count_of_nothing_does_not(
-        self, copied: Copied, issues_of: Find
-    ) -> None:
+    def test_a_rate_promises_a_stream_and_a_count_of_nothing_does_not(self, copied, issues_of):
         folder = copied("new")
         (folder / "sensor_data.npz").unlink()
         metadata(folder, sensor_windows_count=None)
@@ -220,9 +218,7 @@ class TestCameras:
         metadata(folder, sensor_windows_count=0)
         assert issues_of(folder) == ()
 
-    def test_a_promised_stream_that_is_broken_is_told_once(
-        self, copied: Copied, issues_of: Find
-    ) -> None:
+    def test_a_promised_stream_that_is_broken_is_told_once(self, copied, issues_of):
         folder = copied("new")
         (folder / "sensor_data.npz").write_bytes(b"")
         assert [issue.kind for issue in issues_of(folder)] == ["unreadable"]
@@ -343,9 +339,7 @@ class TestChannels:
         assert issue.start_s == pytest.approx(time[1000], abs=0.02)
         assert issue.stop_s == pytest.approx(time[1649], abs=0.02)
 
-    def test_one_depth_that_holds_is_no_frozen_scan(
-        self, copied: Copied, issues_of: Find, change_npz
-    ) -> None:
+    def test_one_depth_that_holds_is_no_frozen_scan(self, copied, issues_of, change_npz):
         folder = copied("raw")
 
         def hold(alines: np.ndarray) -> np.ndarray:

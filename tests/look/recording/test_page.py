@@ -1,16 +1,21 @@
-"""The page of recordings: all of it there, and what is not there said in words."""
+"""The page of recordings: all of it there; which to look at, and what is not there said."""
 
+import pickle
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 
-from pipeline.base.config import Params, load_params
+from pipeline.base.config import Params, Source, load_params
+from pipeline.base.errors import Issue
 from pipeline.base.text import Table
+from pipeline.data import open_recordings
 from pipeline.look.page.blocks import Issues, Picture, Report, Text, Tokens
 from pipeline.look.page.writing import write_report
-from pipeline.look.recording.page import recordings_report
+from pipeline.look.recording.page import RecordingsOverview, recordings_report, survey_recordings
 from pipeline.look.subject import subject_of
 
 PARAMS = Path(__file__).resolve().parents[3] / "params.yaml"
@@ -35,12 +40,7 @@ def words_of(report: Report) -> str:
 
 
 @pytest.mark.slow
-def test_the_page_of_a_recording_is_sound(
-    recorded: Path,
-    params_of: Callable[..., Params],
-    tmp_path: Path,
-    assert_page_is_sound: Callable[[Path], None],
-) -> None:
+def test_the_page_of_a_recording_is_sound(recorded, params_of, tmp_path, assert_page_is_sound):
     report = report_of(params_of(recorded, "inspect.samples=2", "inspect.ticks=2"))
     assert_page_is_sound(write_report(tmp_path, report)[0])
 
@@ -64,9 +64,7 @@ def test_the_page_of_a_recording_is_whole(recorded: Path, params_of: Callable[..
     ]
 
 
-def test_what_is_missing_is_said(
-    recorded: Path, params_of: Callable[..., Params], tmp_path: Path
-) -> None:
+def test_what_is_missing_is_said(recorded, params_of, tmp_path):
     lab = Path(shutil.copytree(recorded, tmp_path / "lab"))
     (folder,) = lab.iterdir()
     sensor = next(path for path in folder.iterdir() if "sensor" in path.name)
@@ -83,9 +81,7 @@ def test_what_is_missing_is_said(
     assert folder.name in first.issues[0].episode
 
 
-def test_all_episodes_are_checked_and_some_are_shown(
-    recorded: Path, params_of: Callable[..., Params], tmp_path: Path
-) -> None:
+def test_all_episodes_are_checked_and_some_are_shown(recorded, params_of, tmp_path):
     (episode,) = recorded.iterdir()
     for index in range(4):
         shutil.copytree(episode, tmp_path / f"episode_{index}")
@@ -98,3 +94,159 @@ def test_all_episodes_are_checked_and_some_are_shown(
     assert titles[2:4] == ["episode_1", "episode_2"]
     names = [one.name for one in report.blocks(Picture)]
     assert "episode1-episode_1-views" in names and "episode2-episode_2-views" in names
+
+
+def survey(*sources: Source, views: Sequence[str] | None = None, **data: Any) -> RecordingsOverview:
+    document = {
+        "data": {"sources": [source.model_dump() for source in sources], **data},
+        "vlm": {"checkpoint": "none"},
+    }
+    params = Params.model_validate(document)
+    return survey_recordings(open_recordings(params.data.sources, views=views), params)
+
+
+@pytest.fixture
+def many(healthy: Path, tmp_path: Path) -> Path:
+    """Three old episodes that differ."""
+    (episode,) = (healthy / "old" / "Red_point").iterdir()
+    for name in "abc":
+        folder = Path(shutil.copytree(episode, tmp_path / "many" / name))
+        document = pickle.loads((folder / "data.pkl").read_bytes())
+        document["action"][1, 0] += 0.001 * ord(name)
+        (folder / "data.pkl").write_bytes(pickle.dumps(document))
+    return tmp_path / "many"
+
+
+def test_healthy_recordings_of_every_format(healthy: Path) -> None:
+    names = ("raw", "new", "old")
+    found = survey(*(Source(name=name, path=str(healthy / name)) for name in names))
+    assert found.issues == ()
+    assert found.views == ("View1", "View2", "View5") and found.rotation == "rotvec"
+    assert [one.source for one in found.summaries] == list(names)
+    for one in found.summaries:
+        assert one.format == one.source and one.instruction
+        assert one.ticks > 30 and one.vl_rows == -(-one.ticks // 3)
+        assert one.duration_s == pytest.approx(one.ticks / 10, abs=0.5)
+        assert set(one.frames) == {"View1", "View2", "View5"} and min(one.frames.values()) > 30
+    # Only the LeRobot episode has no poses beside its actions: formats may differ in streams.
+    paths = tuple(str(healthy / name) for name in (*names, "lerobot"))
+    assert survey(Source(name="s", path=paths)).issues == ()
+
+
+def test_one_broken_episode_hides_no_other(many: Path) -> None:
+    pickled = many / "b" / "data.pkl"
+    pickled.write_bytes(pickled.read_bytes()[:1000])
+    found = survey(Source(name="s", path=str(many)))
+    assert [one.episode for one in found.summaries] == ["a", "b", "c"]
+    assert [one.errors for one in found.summaries] == [0, 1, 0]
+    broken = found.summaries[1]
+    assert (broken.ticks, broken.counts, broken.instruction) == (0, {}, None)
+    # The file is the issue; that its streams are absent follows and is not told again.
+    (issue,) = found.issues
+    assert broken.issues == [issue] and issue.severity == "error"
+    assert found.choose(1) == (1,) and found.choose(2) == (0, 1) and found.choose(9) == (0, 1, 2)
+
+
+def test_the_same_recording_twice(many: Path) -> None:
+    assert survey(Source(name="s", path=str(many))).issues == (), "equal states, other actions"
+    shutil.copytree(many / "a", many / "d")
+    (many / "d" / "robot_states.npz").unlink()
+    found = survey(Source(name="s", path=str(many)), Source(name="t", path=str(many / "b")))
+    first, second = [issue for issue in found.issues if issue.kind == "duplicate recording"]
+    assert (first.source, first.episode, second.source, second.episode) == ("s", "d", "t", "b")
+    assert f"a ({many / 'a'}): all values of action are equal" in first.message
+    assert f"s/b ({many / 'b'}): " in second.message
+
+
+def test_the_same_recording_in_two_formats(shared_data: Path) -> None:
+    paths = (str(shared_data / "insertion/new"), str(shared_data / "insertion/raw"))
+    found = survey(Source(name="s", path=paths), views=())
+    (issue,) = [issue for issue in found.issues if issue.kind == "duplicate recording"]
+    assert issue.episode == "data_collection_20251108_055533"
+    assert "episode_20251108_055533" in issue.message and "all values of state" in issue.message
+
+
+def test_real_recordings_in_two_versions(shared_data: Path) -> None:
+    # Their motion tells; decoding the videos would tell nothing more.
+    found = survey(Source(name="s", path=str(shared_data / "lerobot")), views=())
+    twice = [issue for issue in found.issues if issue.kind == "duplicate recording"]
+    assert [issue.episode for issue in twice] == [
+        f"cr5_banana_v30_split/episode_{index:06d}" for index in range(5)
+    ]
+    assert "the same recording as cr5_banana_v21/episode_000000" in twice[0].message
+
+
+def test_episodes_that_cannot_be_opened(healthy: Path, tmp_path: Path) -> None:
+    (episode,) = (healthy / "new" / "Red_point").iterdir()
+    shutil.copytree(episode, tmp_path / "new" / "good")
+    shutil.copytree(episode, tmp_path / "new" / "bad")
+    (tmp_path / "new" / "bad" / "metadata.json").write_text("{")
+    found = survey(Source(name="s", path=str(tmp_path / "new")))
+    assert [one.episode for one in found.summaries] == ["good"]
+    (issue,) = found.issues
+    assert (issue.kind, issue.severity, issue.episode) == ("unreadable", "error", "bad")
+    assert found.summaries[0].errors == 0
+
+
+def test_episodes_that_meta_lists_and_are_not_there(healthy: Path, tmp_path: Path) -> None:
+    root = Path(shutil.copytree(healthy / "lerobot", tmp_path / "lerobot"))
+    lines = root / "meta/episodes.jsonl"
+    line = lines.read_text()
+    lines.write_text(line + line.replace('"episode_index": 0', '"episode_index": 1'))
+    (issue,) = survey(Source(name="s", path=str(root))).issues
+    assert (issue.kind, issue.severity, issue.source) == ("missing", "warning", "s")
+    assert "episode_000001" in issue.message
+
+
+def test_ticks_at_another_rate_than_the_recorded_rows(healthy: Path) -> None:
+    sources = [
+        Source(name="held", path=str(healthy / "lerobot"), action_kind="absolute"),
+        Source(name="poses", path=str(healthy / "raw")),
+    ]
+    recorded = (survey(*sources[:1], views=(), action_hz=hz).issues for hz in (10, None))
+    assert not any(issue.kind == "tick rate" for issues in recorded for issue in issues)
+    for action_hz, fate in ((5, "left out between ticks"), (20, "held")):
+        (issue,) = [
+            f
+            for f in survey(*sources, views=(), action_hz=action_hz).issues
+            if f.kind == "tick rate"
+        ]
+        assert (issue.severity, issue.source, issue.episode) == ("warning", "held", "")
+        assert f"ticks at {action_hz} Hz, recorded at 10 Hz: actions are {fate}" in issue.message
+
+
+def test_recordings_of_two_robots(healthy: Path, tmp_path: Path) -> None:
+    (episode,) = (healthy / "old" / "Red_point").iterdir()
+    other = Path(shutil.copytree(episode, tmp_path / "old" / "other"))
+    (other / "robot_states.npz").unlink()
+    # A velocity in the same channels is another kind of action.
+    sources = (
+        Source(name="one", path=str(episode)),
+        Source(name="two", path=str(other), action_kind="velocity"),
+    )
+    found = survey(*sources)
+    (issue,) = [issue for issue in found.issues if issue.kind == "embodiment"]
+    assert issue.severity == "error" and "'one'" in issue.message and "'two'" in issue.message
+
+
+def test_the_choice_spreads_over_sound_episodes(healthy: Path) -> None:
+    (one,) = survey(Source(name="s", path=str(healthy / "old"))).summaries
+    summaries = [replace(one, episode=str(place), issues=[]) for place in range(11)]
+    found = RecordingsOverview(tuple(summaries), (), "rotvec")
+    assert found.choose(3) == (0, 5, 10) and found.choose(1) == (0,)
+    warning, error = (Issue(severity=how, kind="gap", message="") for how in ("warning", "error"))
+    for place, issues in {7: [warning] * 2, 8: [error], 3: [warning] * 3}.items():
+        summaries[place].issues = issues
+    assert found.choose(1) == (8,) and found.choose(2) == (3, 8)
+    assert found.choose(5) == (0, 3, 7, 8, 10) and found.choose(99) == tuple(range(11))
+
+
+def test_a_view_that_most_episodes_have_is_missed(many: Path) -> None:
+    content = pickle.loads((many / "b" / "data.pkl").read_bytes())
+    view = max(content["image"])
+    del content["image"][view]
+    (many / "b" / "data.pkl").write_bytes(pickle.dumps(content))
+    (issue,) = survey(Source(name="s", path=str(many / "*"))).issues
+    assert (issue.severity, issue.kind, issue.episode) == ("warning", "missing", "b")
+    assert issue.stream.startswith("view ")
+    assert issue.message == "not there; most episodes of this source have it"

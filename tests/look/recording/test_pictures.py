@@ -17,7 +17,6 @@ from pipeline.look.page.blocks import Picture, Text
 from pipeline.look.recording.cameras import camera_blocks, draw_views
 from pipeline.look.recording.clocks import Clock, clock_blocks, clock_table, draw_lanes
 from pipeline.look.recording.episode import EpisodeView
-from pipeline.look.recording.samples import cut_samples, draw_samples, window_lengths
 from pipeline.look.recording.streams import (
     contacts,
     draw_motion,
@@ -36,7 +35,6 @@ PARAMS = Params.model_validate(
     }
 )
 Felt = Callable[..., EpisodeView]
-Words = Callable[[Figure], str]
 
 
 def test_views_are_shown_at_ticks_with_the_age_of_each_frame(view: EpisodeView) -> None:
@@ -147,9 +145,7 @@ def test_lanes_show_every_clock_once_with_its_gap(view: EpisodeView) -> None:
     assert near.get_xlim()[0] < gap.start_s - view.zero < near.get_xlim()[1]
 
 
-def test_lines_lead_from_the_frame_to_its_row_and_from_there_to_its_ticks(
-    view: EpisodeView,
-) -> None:
+def test_lines_lead_from_the_frame_to_its_row_and_from_there_to_its_ticks(view):
     assert view.timeline is not None
     line, (_, near) = view.timeline, draw_lanes(view).axes
     lines = [lines for lines in near.collections if isinstance(lines, LineCollection)]
@@ -205,15 +201,8 @@ def test_channels_that_a_number_tells_apart_share_a_name() -> None:
 
 
 def test_the_same_recording_is_the_same_bytes(view: EpisodeView) -> None:
-    draws: tuple[Callable[[], Figure], ...] = (
-        lambda: draw_views(view, [3, 5]),
-        lambda: draw_sensor(view),
-        lambda: draw_motion(view),
-        lambda: draw_lanes(view),
-        lambda: draw_samples(view, cut_samples(view, PARAMS), window_lengths(PARAMS)),
-    )
-    for draw in draws:
-        assert saved(draw(), "png") == saved(draw(), "png")
+    for draw in (draw_sensor, draw_lanes):
+        assert saved(draw(view), "png") == saved(draw(view), "png")
 
 
 def saved(figure: Figure, format: str) -> bytes:
