@@ -65,8 +65,8 @@ def test_the_linear_fit_continues_what_is_linear(tiny_store: Make, tmp_path: Pat
 
 
 def test_a_joint_that_stands_elsewhere_does_not_upset_the_linear_fit(
-    tiny_store: Make, tmp_path: Path, monkeypatch: Patch
-) -> None:
+    tiny_store, tmp_path, monkeypatch
+):
     """It stands still in the training episodes, but for rounding, and elsewhere in the others."""
     store = FeatureStore.open(tiny_store(tmp_path))
     joints = {"names": [f"joint_{joint}" for joint in range(5)], "units": ["rad"] * 5}

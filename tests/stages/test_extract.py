@@ -20,7 +20,7 @@ from pipeline.store import FeatureStore
 from pipeline.store.chunks import write_seal
 from stages.command import run
 from stages.extract import main
-from tests.data.conftest import edit_json
+from tests.data.conftest import Truth, edit_json, write_raw
 from tests.data.conftest import write_lerobot as write_small_lerobot
 
 ROOT = Path(__file__).resolve().parents[2]
