@@ -46,6 +46,7 @@ from experiments.recipes import (
     PATCHES,
     RECIPES,
     ROLLOUTS,
+    SLOTS,
     STORES,
     TABLES,
     Table,
@@ -371,20 +372,22 @@ def _draw_size(wanted: Namespace) -> None:
         raise SystemExit(f"{wanted.out}: nothing to draw. Make the table `slots` there first.")
 
     def draw() -> Any:
-        figure, panels = style.panels(8.5, 5.2, 1, 1)
+        figure, panels = style.panels(9.0, 4.4, 1, 1)
         for index, (name, point) in enumerate(points.items()):
             rate, low, high = (100 * number for number in point["success"])
-            learned = "pooler" in name
+            marker = "s" if "pooler" in name else "^" if name in SLOTS and "8" in name else "o"
             panels.errorbar(
                 point["row_bytes"],
                 rate,
                 [[rate - low], [high - rate]],
-                fmt="s" if learned else "o",
+                fmt=marker,
                 color=style.PALETTE[index % len(style.PALETTE)],
-                label=name,
+                label="mean, grid 4x4" if name == AS_IT_IS else name,
             )
-        panels.set(xscale="log", xlabel="bytes of a VL row's features", ylabel="inserted [%]")
-        panels.legend(fontsize="small", loc="lower right")
+        panels.set(xscale="log", xlabel="kB of a VL row's features", ylabel="inserted [%]")
+        panels.set_xticks([500, 2000, 5000, 20_000, 50_000], ["0.5", "2", "5", "20", "50"])
+        panels.minorticks_off()
+        panels.legend(fontsize="small", loc="center left", bbox_to_anchor=(1.0, 0.5))
         return figure
 
     (picture,) = style.write(wanted.out, {"success_bytes.png": draw})
