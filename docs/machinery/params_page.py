@@ -74,8 +74,8 @@ def words(schema: Schema, definitions: Schema) -> str:
         return _code(schema["const"])
     if "enum" in schema:
         return _either([_code(value) for value in schema["enum"]])
-    if "anyOf" in schema:
-        return _either([words(one, definitions) for one in schema["anyOf"]])
+    if options := schema.get("anyOf", schema.get("oneOf")):
+        return _either([words(one, definitions) for one in options])
     if "prefixItems" in schema:
         return f"list of ({'), ('.join(words(one, definitions) for one in schema['prefixItems'])})"
     if schema["type"] == "array":

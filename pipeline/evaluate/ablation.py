@@ -190,7 +190,7 @@ def zeroed(stream: str, mean: NDArray[np.floating]) -> Alter:
     def alter(indices: BatchIndices, batch: Batch) -> Batch:
         values = getattr(batch, stream)
         level = torch.tensor(mean, dtype=torch.float32, device=values.device)
-        return replace(batch, **{stream: level.expand(values.shape)})
+        return replace(batch, **{stream: level.expand(*values.shape[:-1], level.shape[-1])})
 
     return alter
 

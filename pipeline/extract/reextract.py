@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from pipeline.base.arrays import widen
+from pipeline.base.arrays import code_size, widen
 from pipeline.base.config import Params
 from pipeline.base.differences import describe, differences
 from pipeline.base.digests import ContentDigests, ledger_path
@@ -47,7 +47,7 @@ class Deviation:
     def __str__(self) -> str:
         pixels = "" if self.same_pixels else "; the decoder of today gives other pixels"
         return (
-            f"{self.where}: slot {self.slot} deviates {self.relative:.2e} of its root mean square, "
+            f"{self.where}: slot {self.slot} deviates {self.relative:.2e} of its size, "
             f"{self.absolute:.2e} absolute{pixels}"
         )
 
@@ -146,7 +146,8 @@ def reextract(path: Path, params: Params, say: Callable[[str], None]) -> Reextra
 
 def _compare(store: FeatureStore, row: ReadyRow, features: NDArray[Any]) -> Deviation:
     """Compare the stored row with new features (variant x slot, dim), both in storage dtype."""
-    deviations = slot_deviations(widen(store.array(FEATURES)[row.row]), widen(features))
+    stored = store.array(FEATURES)[row.row]
+    deviations = slot_deviations(widen(stored), widen(features), code_size(stored))
     slot = deviations.worst
     same_pixels = store.array("vl/key")[row.row].tobytes() == row.key
     absolute, relative = float(deviations.absolute.max()), float(deviations.relative[slot])

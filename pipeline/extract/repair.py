@@ -29,7 +29,14 @@ from pipeline.store.paths import (
     refuse_replaced,
     unfinished_plans,
 )
-from pipeline.store.schema import CHECKSUMS, INCREMENTAL, KEYS, chunk_paths, read_specs
+from pipeline.store.schema import (
+    CHECKSUMS,
+    INCREMENTAL,
+    KEYS,
+    chunk_paths,
+    read_spec,
+    read_specs,
+)
 from pipeline.store.verification import Verification, read_arrays
 from pipeline.store.writer import environment_runs, sync_folders
 
@@ -152,10 +159,13 @@ def _carry_rows(verification: Verification, build: StoreBuild) -> int:
         for path in build.files(name).paths:  # all zero if it was laid out anew
             path.unlink(missing_ok=True)
     # Chunk files without damage are linked; from the others, the sound rows are copied.
-    spec, damaged = build.specs[FEATURES], verification.damaged_chunks(FEATURES)
+    spec, damaged = read_spec(store, FEATURES), verification.damaged_chunks(FEATURES)
+    # Chunks of stores of schema 1 are larger.
+    alike = spec.chunk_rows == build.specs[FEATURES].chunk_rows
     step = max(1, _BLOCK_BYTES // max(1, spec.row_bytes))
-    with closing(ChunkFiles(build.part, spec)) as files:  # it does not write to linked chunks
-        for chunk, path in enumerate(chunk_paths(store, spec)):
+    # It does not write to linked chunks.
+    with closing(ChunkFiles(build.part, build.specs[FEATURES])) as files:
+        for chunk, path in enumerate(chunk_paths(store, spec) if alike else ()):
             rows = spec.chunk_rows_of(chunk)
             if chunk not in damaged and sound[rows.start : rows.stop].all():
                 files.link(chunk, path)

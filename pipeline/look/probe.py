@@ -77,11 +77,12 @@ def draw_gains(study: ProbeStudy) -> Figure:
     plain = [result for result in study.slots if result.name.cell is None]
     poolings = list({result.name.pooling: None for result in study.groups})
     named = sorted([*study.groups, *plain], key=lambda result: poolings.index(result.name.pooling))
-    rows = list(dict.fromkeys(_row(result.name) for result in study.slots))
+    rows = list(dict.fromkeys(_row(result.name) for result in (*study.groups, *study.slots)))
     maps: dict[str, list[ProbeResult]] = defaultdict(list)
     for result in study.slots:
         if result.name.cell is not None:
-            maps[f"{_row(result.name)}, {result.name.view}"].append(result)
+            of_grid = "" if result.name.pooling == "grid" else f", {result.name.pooling}"
+            maps[f"{_row(result.name)}{of_grid}, {result.name.view}"].append(result)
     gains = {result: study.gain(result).value for result in (*study.groups, *study.slots)}
     best = {title: max(gains[result] for result in cells) for title, cells in maps.items()}
     shown = sorted(maps, key=best.__getitem__, reverse=True)[:_MAPS]

@@ -14,9 +14,11 @@ from numpy import ndarray
 from numpy.typing import NDArray
 from torch import Tensor
 
+from pipeline.base.arrays import array_of, code_size, widen
 from pipeline.base.commands import command
 from pipeline.base.config import TuningParams, VLMParams
 from pipeline.base.errors import CheckpointMismatch
+from pipeline.base.packing import pack
 from pipeline.base.source import row_key
 from pipeline.policy.checkpoint import PolicyCheckpoint
 from pipeline.vlm.feature_spec import live_differences
@@ -71,7 +73,7 @@ def prove(checkpoint: PolicyCheckpoint, features: LiveFeatures, say: Callable[[s
 
     Raises `CheckpointMismatch` beyond the tolerance; it names slots, deviations, both prompts if
     they differ, and the entries of the feature spec that differ. `say` gets the largest deviation
-    of a number, relative to the root mean square of its slot, or a warning if the checkpoint has no
+    of a number, relative to its size (`slot_deviations`), or a warning if the checkpoint has no
     golden rows.
     """
     if not checkpoint.golden:
@@ -87,7 +89,11 @@ def prove(checkpoint: PolicyCheckpoint, features: LiveFeatures, say: Callable[[s
     prompts: list[str] = []
     for row in checkpoint.golden:
         live, valid = features([row.frames], row.instruction)
-        deviation = slot_deviations(row.features, live[0].numpy())
+        held, today = (
+            array_of(pack(numbers.float(), spec["storage_dtype"]))
+            for numbers in (torch.from_numpy(row.features), live[0])
+        )
+        deviation = slot_deviations(widen(held), widen(today), code_size(held))
         relative = deviation.relative
         largest = max(largest, (float(relative.max()), deviation.worst))
         other = np.flatnonzero(valid[0].numpy() != row.slot_valid).tolist()
@@ -113,7 +119,7 @@ def prove(checkpoint: PolicyCheckpoint, features: LiveFeatures, say: Callable[[s
         lines = [
             f"{len(refused)} of {len(checkpoint.golden)} golden rows are not the features that the "
             "policy was trained on: computed again by the live model, slots deviate by more than "
-            f"{tolerance:.0e} of their root mean square",
+            f"{tolerance:.0e} of their size",
             *refused,
             *prompts,
             *differing,
@@ -123,6 +129,6 @@ def prove(checkpoint: PolicyCheckpoint, features: LiveFeatures, say: Callable[[s
         raise CheckpointMismatch("\n".join(lines))
     say(
         f"{len(checkpoint.golden)} golden rows computed again: the largest deviation is "
-        f"{largest[0]:.1e} of a slot's root mean square ({slot_name(slots[largest[1]])}), "
+        f"{largest[0]:.1e} of its size ({slot_name(slots[largest[1]])}), "
         f"{tolerance:.0e} is tolerated"
     )

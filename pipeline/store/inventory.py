@@ -19,6 +19,7 @@ from typing import Literal
 
 import numpy as np
 
+from pipeline.base.arrays import packed_dim
 from pipeline.base.commands import command
 from pipeline.base.digests import LEDGER_SUFFIX, is_ledger
 from pipeline.base.errors import ConfigError, PipelineError, StoreIncomplete, StoreLocked
@@ -277,7 +278,8 @@ def _spec(entry: StoreEntry) -> tuple[str, str]:
     settings |= {name: document[name] for name in _SPEC_ENTRIES if document.get(name)}
     return entry.attributes.feature_spec.digest[:8], ", ".join(
         [
-            f"{features.shape[1]} slots x {features.shape[2]} in {features.stored_dtype}",
+            f"{features.shape[1]} slots x "
+            f"{packed_dim(features.stored_dtype, features.shape[2])} in {features.stored_dtype}",
             f"sensor in {entry.specs['sensor/values'].dtype.name}",
             *(
                 f"{name} {shorten(str(value), 60, placeholder='…')}"

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.base.arrays import packed_dim, widen
+from pipeline.base.arrays import dim_of, widen
 from pipeline.base.source import GoldenRow
 from pipeline.store.chunks import check_seal
 from pipeline.store.episodes import Episode, check_index, check_positions, episode_of, read_episodes
@@ -129,8 +129,7 @@ class FeatureStore:
     def feature_shape(self) -> tuple[int, int]:
         """(slot, dim) of one variant of a VL row."""
         features = self._arrays[FEATURES]
-        _, slots, entries = features.shape
-        return slots // self.variants, packed_dim(features.dtype, entries)
+        return features.shape[1] // self.variants, dim_of(features)
 
     @property
     def action_dim(self) -> int:

@@ -11,8 +11,7 @@ import numpy as np
 import torch
 from tqdm import tqdm
 
-from pipeline.base.commands import command
-from pipeline.base.config import TrainHeadParams, setting
+from pipeline.base.config import TrainHeadParams
 from pipeline.base.text import duration
 from pipeline.policy.observation import PolicyShape
 from pipeline.store import FeatureStore
@@ -145,8 +144,8 @@ def describe_data(
     ]
     if (dtype := store.spec.get("storage_dtype")) in ("int8", "float8"):
         lines.append(
-            f"features are stored in {dtype}: {command('probe', setting('probe.codecs', [dtype]))} "
-            "on a store in float32 says what that loses"
+            f"features are stored in {dtype}; stages.probe with probe.codecs on a store in float32 "
+            "says what that loses"
         )
     if anchored := shape.anchored(store.streams["action"]["names"]):
         lines.append(f"anchored at the newest frame: {', '.join(anchored)}")

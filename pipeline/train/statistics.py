@@ -83,7 +83,7 @@ def fit_normalization(
     if features is not None:
         slots = store.attrs["slots"][: store.feature_shape[0]]
         places = slot_places(slots)
-        index = shared_statistics(places, len(slots) // len(places))
+        index = shared_statistics(places, len(slots) // max(1, len(places)))
         if len({*index}) < len(index):
             features = features.shared(index)
         usual = np.percentile(features.std, 75, axis=-1, keepdims=True)

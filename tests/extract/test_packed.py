@@ -1,6 +1,7 @@
 """A store in int8 or float8 is read, checked, continued and trained from like any other."""
 
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ from safetensors.torch import load_file, save_file
 from pipeline.base.arrays import widen
 from pipeline.base.config import Params
 from pipeline.base.packing import unpack
+from pipeline.evaluate.ablation import zeroed
 from pipeline.extract.reextract import reextract
 from pipeline.policy.policy import Policy
 from pipeline.store import FeatureStore
@@ -68,8 +70,12 @@ def test_a_batch_hands_out_codes_and_the_policy_reads_numbers(stores, dtype):
     params = stores[dtype][0].train_head.model_copy(update={"horizon": 4})
     policy = Policy(params, shape, normalization).eval()
     read = policy.act(batch)
-    batch.features = unpack(batch.features)
-    torch.testing.assert_close(policy.act(batch), read)
+    plain = replace(batch, features=unpack(batch.features))
+    torch.testing.assert_close(policy.act(plain), read)
+    # A stream that is off: its mean, whatever it is stored in, of two rows too.
+    both = store.gather(ticks[:6], 4, 5, 5, feature_history=2)
+    off = zeroed("features", np.zeros((2 * shape.slots, shape.feature_dim)))(None, both)
+    assert off.features.shape == (6, 2 * shape.slots, shape.feature_dim)
 
 
 def test_a_part_of_a_packed_store_is_taken_over(stores, tmp_path):
@@ -94,6 +100,9 @@ def test_a_part_of_a_packed_store_is_taken_over(stores, tmp_path):
     assert same and all(same)
 
 
+NORMED = {"layers": (-1,), "norms": (True,)}
+
+
 def test_a_model_with_huge_channels_keeps_the_others(stores, tmp_path):
     """As released models have: a few channels hundreds of times larger than all others."""
     params, plain = stores["float32"]
@@ -108,7 +117,7 @@ def test_a_model_with_huge_channels_keeps_the_others(stores, tmp_path):
     found = {}
     for dtype in ("float32", "float8", "int8"):
         extract = {"store": tmp_path / f"{dtype}.zarr", "dtype": dtype}
-        vlm = {"checkpoint": str(folder), "layers": (-1,), "norms": (True,)}
+        vlm = {"checkpoint": str(folder)} | NORMED
         changed = params.model_copy(
             update={
                 "vlm": params.vlm.model_copy(update=vlm),
@@ -133,3 +142,10 @@ def test_a_model_with_huge_channels_keeps_the_others(stores, tmp_path):
     assert lost["int8"][others[~beside]].max() < 0.02
     assert lost["int8"][others[beside]].min() > 0.1  # what shares their scales is coarse
     assert plain.feature_shape[1] == len(sizes)
+    some = params.verify.model_copy(update={"reextract": 4})
+    for dtype in ("int8", "float8"):  # recomputed rows differ by no more than a code
+        place = tmp_path / f"{dtype}.zarr"
+        extract = params.extract.model_copy(update={"store": place, "dtype": dtype})
+        vlm = params.vlm.model_copy(update={"checkpoint": str(folder)} | NORMED)
+        asked = params.model_copy(update={"vlm": vlm, "extract": extract, "verify": some})
+        assert not reextract(place, asked, lambda line: None).beyond

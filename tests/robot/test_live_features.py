@@ -145,7 +145,7 @@ class TestRefused:
                 weights.mul_(1.05)
         said = refusal(checkpoint, live)
         assert "4 of 4 golden rows are not the features that the policy was trained on" in said
-        assert "slots deviate by more than 1e-03 of their root mean square" in said
+        assert "slots deviate by more than 1e-03 of their size" in said
         assert "layer 3 mean " in said or "layer 3 grid View" in said
         assert "and 43 more" in said
         assert "The feature specs agree in every entry" in said

@@ -8,6 +8,7 @@ import socket
 import subprocess
 import time
 from collections.abc import Callable
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,7 @@ import zarr
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from pipeline.base.arrays import packed_size
 from pipeline.base.errors import ConfigError, StoreIncomplete, StoreLocked
 from pipeline.store import (
     FeatureStore,
@@ -488,9 +490,11 @@ class TestChunkRule:
         least = spec.chunk_rows == spec.row_multiple
         assert least or spec.chunk_bytes <= 64 * 2**20
         assert 0 <= spec.chunk_count * spec.chunk_rows - rows < spec.chunk_rows or not rows
-        # All tokens of three views of 360 x 640 in float16.
-        tokens = ArraySpec("vl/features", (rows, 897, 2048), np.dtype("f2"))
-        assert tokens.chunk_bytes <= 64 * 2**20
+        # Grids and all tokens of three views of 360 x 640 and wider models.
+        for slots, dim in product((49, 299, 897), (2048, 3584)):
+            for held, kind in (("f2", "float16"), ("i1", "int8"), ("u1", "float8")):
+                shape = (rows, slots, packed_size(kind, dim))
+                assert ArraySpec("vl/features", shape, np.dtype(held)).chunk_bytes <= 110e6
 
     @given(
         rows=st.integers(0, 10**8),

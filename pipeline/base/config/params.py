@@ -249,4 +249,5 @@ def _section_in(annotation: Any) -> Any:
     """The section type of a field, or of its tuple's entries."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return annotation
-    return _section_in(next(part for part in get_args(annotation) if part is not Ellipsis))
+    inside = map(_section_in, get_args(annotation))
+    return next((section for section in inside if section is not None), None)

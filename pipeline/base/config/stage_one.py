@@ -4,7 +4,14 @@ import re
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BeforeValidator, Field, field_validator, model_validator
+from pydantic import (
+    BeforeValidator,
+    Discriminator,
+    Field,
+    Tag,
+    field_validator,
+    model_validator,
+)
 
 from pipeline.base.config.section import Globs, Output, PathOrName, Place, Section, Seed
 from pipeline.base.hub import could_be_hub_id
@@ -12,7 +19,7 @@ from pipeline.base.hub import could_be_hub_id
 RecordingFormat = Literal["auto", "raw", "new", "old", "lerobot"]
 PoolingName = Literal["mean", "image_mean", "text_mean", "view_mean", "grid", "tokens", "last"]
 Dtype = Literal["float32", "float16", "bfloat16"]
-StorageDtype = Dtype | Literal["float8", "int8"]
+StorageDtype = Literal["float32", "float16", "bfloat16", "float8", "int8"]
 GridSide = Annotated[int, Field(ge=1, le=64)]
 Layer = int | Literal["vision"]
 """Index of a decoder layer, or the vision tower."""
@@ -28,7 +35,10 @@ class GridPooling(Section):
         return f"grid {self.grid[0]}x{self.grid[1]}"
 
 
-Pooling = PoolingName | GridPooling
+Pooling = Annotated[
+    Annotated[PoolingName, Tag("name")] | Annotated[GridPooling, Tag("size")],
+    Discriminator(lambda value: "name" if isinstance(value, str) else "size"),
+]
 
 
 def _workers(value: Any) -> Any:
@@ -270,8 +280,8 @@ class VerifyParams(Section):
     reextract: int = Field(default=0, ge=0, le=10**9)
     """Number of random rows to compute again with today's software and hardware."""
     tolerance: float | None = Field(default=None, gt=0, le=1e3)
-    """Largest deviation of a recomputed row, relative to the root mean square of its slot; null: a
-    value that fits the dtypes in which the row was computed and stored."""
+    """Largest deviation of a recomputed number, relative to it or to its slot without the largest
+    tenth; null: a value that fits the dtypes in which the row was computed and stored."""
     seed: Seed = 0
     """Seed of the choice of rows."""
     repair: bool = False

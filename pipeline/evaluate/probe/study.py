@@ -13,6 +13,7 @@ from threadpoolctl import threadpool_limits
 from tqdm import tqdm
 
 from pipeline.base.config import ProbeParams
+from pipeline.base.errors import NumericsError, StoreMismatch
 from pipeline.base.packing import pack, unpack
 from pipeline.evaluate.figures import Figure
 from pipeline.evaluate.probe.inputs import (
@@ -30,6 +31,8 @@ from pipeline.train.statistics import check_finite
 
 _MOST_SINGLE = 300
 """Most slots that are scored one by one."""
+_ROUNDING_SHARE = 1e-5
+"""A spread below this share of a channel's size is rounding: the channel does not vary."""
 _ROUNDING = 1e-9
 """A gain below this counts as none."""
 
@@ -135,6 +138,12 @@ def probe(store: FeatureStore, params: ProbeParams) -> ProbeStudy:
     Raises `StoreMismatch` where fewer than two recordings are long enough, and `NumericsError` on
     NaN or inf, naming the place.
     """
+    stored = store.spec.get("storage_dtype", "float32")
+    if params.codecs and stored != "float32":
+        raise StoreMismatch(
+            f"probe.codecs: expected a store in float32, from which other types are judged, found "
+            f"{stored} in {store.path}. Extract it with extract.dtype float32, some recordings do"
+        )
     action = store.array("tick/action")
     check_finite(store, "tick", range(store.ticks), "actions", action)
     folds = fold_by_recording(store, params.folds, params.horizon, params.max_ticks, params.repeats)
@@ -163,13 +172,21 @@ def probe(store: FeatureStore, params: ProbeParams) -> ProbeStudy:
 
         def change(values: Values) -> Values:
             changed = unpack(pack(torch.from_numpy(values), codec)).float().numpy()
-            spread = np.maximum(values.std(axis=0), np.finfo(np.float32).tiny)
-            squares.append(float(np.mean(((changed - values) / spread) ** 2)))
+            if not np.isfinite(changed).all():
+                raise NumericsError(
+                    f"probe.codecs {codec}: {group.name.label} has numbers up to "
+                    f"{np.abs(values).max():.3g}, which {codec} cannot hold. Leave it out."
+                )
+            spread = values.std(axis=0, dtype=np.float64)
+            varies = spread > _ROUNDING_SHARE * np.abs(values).max(axis=0)
+            if varies.any():
+                errors = (changed - values)[:, varies] / spread[varies]
+                squares.append(float(np.mean(errors**2)))
             return changed
 
         inputs, _ = read_slots(store, rows, fold[:, first], group.slots, change)
         row_bytes = pack(torch.zeros(len(group.slots), dim), codec).nbytes
-        error = float(np.sqrt(np.mean(squares)))
+        error = float(np.sqrt(np.mean(squares or [0.0])))
         return CodecResult(group, codec, row_bytes, error, score(inputs[of_tick]))
 
     def result(own: tuple[int, ...]) -> ProbeResult:

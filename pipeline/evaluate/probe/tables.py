@@ -26,6 +26,7 @@ def write_tables(folder: Path, study: ProbeStudy) -> list[Path]:
         "groups.csv": [_row(study, result) for result in ranked(study.groups)],
         "targets.csv": _target_rows(study),
     }
+    tables = {name: rows for name, rows in tables.items() if rows}  # slots may be too many
     write_document(folder / "metrics.json", metrics(study))
     files = (Table.of(rows).write_csv(folder / name) for name, rows in tables.items())
     return [folder / "metrics.json", *files]
@@ -88,7 +89,7 @@ def ranking(study: ProbeStudy) -> Table:
 
 
 def codec_table(study: ProbeStudy) -> Table:
-    """What each codec would lose of each group, the fewest bytes last."""
+    """What each codec would lose of each group."""
     rows = [
         [
             result.codec,
@@ -97,9 +98,9 @@ def codec_table(study: ProbeStudy) -> Table:
             f"{result.error:.2g}",
             f"{result.row_bytes:,}",
         ]
-        for result in sorted(study.codecs, key=lambda result: -result.row_bytes)
+        for result in study.codecs
     ]
-    heads = ["extract.dtype", "what is read", "R2 less than stored", "error [std]", "bytes a row"]
+    heads = ["extract.dtype", "what is read", "R2 minus stored", "error [std]", "bytes a row"]
     return Table(heads, rows)
 
 
@@ -117,6 +118,8 @@ def notes(study: ProbeStudy) -> list[str]:
         "inputs fewer than channels are their main directions over all folds",
         "valid: the share of ticks that have a slot; elsewhere its mean is read",
     ]
+    if not study.slots:
+        lines.append("single slots are too many to be scored one by one")
     if single > TOP:
         lines.append(f"the other {single - TOP} slots are in slots.csv")
     return lines
@@ -150,9 +153,11 @@ def advice(study: ProbeStudy) -> str:
             "one with the fewest slots is recommended."
         )
     name = advised.chosen.name
+    kind, _, sides = name.pooling.partition(" ")
+    pooling = f"{{{kind}: [{sides.replace('x', ', ')}]}}" if sides else name.pooling
+    norms = "" if name.layer == "vision" else f"norms: [{json.dumps(name.norm)}], "
     lines.append(
-        f"recommended for params.yaml: vlm: {{layers: [{name.layer}], "
-        f"norms: [{json.dumps(name.norm)}], pooling: [{name.pooling}]}}"
+        f"recommended for params.yaml: vlm: {{layers: [{name.layer}], {norms}pooling: [{pooling}]}}"
     )
     return "\n".join(lines)
 

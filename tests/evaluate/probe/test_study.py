@@ -76,7 +76,7 @@ def test_a_codec_is_judged_by_its_error_and_by_what_it_costs(
     assert all(result.error > 0.5 for result in int8)
     assert all(result.difference.value < -0.2 for result in int8)
     assert metrics(study)["codecs"][study.groups[0].name.label]["int8"]["row_bytes"] == 50
-    assert "R2 less than stored" in table(study)
+    assert "R2 minus stored" in table(study)
 
 
 @pytest.fixture
