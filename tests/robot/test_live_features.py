@@ -111,8 +111,8 @@ def proven(checkpoint: PolicyCheckpoint, live: LiveFeatures) -> tuple[int, float
     prove(checkpoint, live, said.append)
     (line,) = said
     found = re.fullmatch(
-        r"(\d+) golden rows computed again: the largest deviation is (\S+) of a slot's root mean "
-        r"square \(layer .+\), (\S+) is tolerated",
+        r"(\d+) golden rows computed again: the largest deviation is (\S+) of its size "
+        r"\(layer .+\), (\S+) is tolerated",
         line,
     )
     assert found, line
