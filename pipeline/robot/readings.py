@@ -157,13 +157,13 @@ class RobotMemory:
         """The newest features; None until the first came."""
         return self._seen[0] if self._seen else None
 
-    def forget_features(self) -> None:
-        """Forget all features: what follows belongs to another prompt."""
-        self._seen.clear()
-
     @features.setter
     def features(self, seen: SeenFeatures) -> None:
         self._seen.appendleft(seen)
+
+    def forget_features(self) -> None:
+        """Forget all features: what follows belongs to another prompt."""
+        self._seen.clear()
 
     @classmethod
     def of(cls, policy: "Policy") -> "RobotMemory":
@@ -198,11 +198,14 @@ class RobotMemory:
             fields |= {name: values, f"{name}_valid": np.array(valid), f"{name}_age": ages}
         if (seen := self.features) is not None:
             ages = (self.time_s - seen.frame_time_s).astype(np.float32)
-            lacking = (self._seen.maxlen or 1) - len(self._seen)
-            rows = [*self._seen, *[self._seen[-1]] * lacking]  # as before an episode's first row
+            features, valid = seen.features, seen.slot_valid
+            if (history := self._seen.maxlen or 1) > 1:
+                rows = [*self._seen, *[self._seen[-1]] * (history - len(self._seen))]
+                features = np.concatenate([row.features for row in rows])
+                valid = np.concatenate([row.slot_valid for row in rows])
             fields |= {
-                "features": np.concatenate([row.features for row in rows]),
-                "slot_valid": np.concatenate([row.slot_valid for row in rows]),
+                "features": features,
+                "slot_valid": valid,
                 "feature_age": np.array(np.nanmin(ages)),
                 "view_age": ages,
             }

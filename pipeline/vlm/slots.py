@@ -64,6 +64,12 @@ def slots_of(
         for pooling in vlm.pooling
         for slot in _slots_of(layer, norm, pooling, views, vlm.grid, tokens)
     )
+    cells = [(s.layer, s.norm, s.view, s.cell, s.grid) for s in slots if s.cell is not None]
+    if len({*cells}) < len(cells):
+        raise VLMError(
+            f"vlm.pooling: two of {', '.join(map(str, vlm.pooling))} give the same cells; `grid` has "
+            f"vlm.grid {vlm.grid[0]}x{vlm.grid[1]}, `tokens` {tokens[0]}x{tokens[1]}"
+        )
     if not slots:
         raise VLMError(
             f"vlm.pooling {list(vlm.pooling)} gives nothing without a view; add `mean` or `last`"

@@ -238,6 +238,7 @@ def test_row_key_moves_with_spec_prompt_pixels_shape_and_view(spec_of, make_fram
         ({"layers": [-1, 3]}, r"each layer once, found \[-1, 3\]"),
         ({"pooling": ["mean", "mean"]}, r"vlm\.pooling: each may stand once"),
         ({"layers": ["vision"], "pooling": ["grid", "last"]}, "pooling last: the vision tower"),
+        ({"pooling": ["grid", {"grid": [4, 4]}]}, "two of grid, grid 4x4 give the same cells"),
         ({"adapter": "/nowhere"}, r"vlm\.adapter /nowhere: no such folder"),
     ],
 )
