@@ -67,8 +67,8 @@ def slots_of(
     cells = [(s.layer, s.norm, s.view, s.cell, s.grid) for s in slots if s.cell is not None]
     if len({*cells}) < len(cells):
         raise VLMError(
-            f"vlm.pooling: two of {', '.join(map(str, vlm.pooling))} give the same cells; `grid` has "
-            f"vlm.grid {vlm.grid[0]}x{vlm.grid[1]}, `tokens` {tokens[0]}x{tokens[1]}"
+            f"vlm.pooling: two of {', '.join(map(str, vlm.pooling))} give the same cells; `grid` "
+            f"has vlm.grid {vlm.grid[0]}x{vlm.grid[1]}, `tokens` {tokens[0]}x{tokens[1]}"
         )
     if not slots:
         raise VLMError(
