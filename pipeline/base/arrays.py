@@ -90,7 +90,7 @@ def widen(values: NDArray[Any]) -> NDArray[Any]:
         return codes * _spread(scales, dtype, dim)
 
 
-def code_size(values: NDArray[Any]) -> NDArray[np.float32] | float:
+def code_size(values: NDArray[Any]) -> NDArray[Any] | float:
     """How far apart two neighbouring codes of packed values are, at each number; 0 of others."""
     if (dtype := _packed(values)) is None:
         return 0.0
