@@ -276,8 +276,9 @@ class Prefetch(Iterator[tuple[BatchIndices, Batch]], AbstractContextManager["Pre
             buffer.copied.synchronize()
         count = len(indices.ticks)
         if buffer.batch is None or len(buffer.batch) != count:
-            lengths = (*self._windows[:3], self._windows[5])
-            empty = self._store.gatherer.empty_batch(count, *lengths, but=self._on_device)
+            empty = self._store.gatherer.empty_batch(
+                count, *self._windows[:3], feature_history=self._windows[5], but=self._on_device
+            )
             buffer.batch = empty.pin() if self._device.type == "cuda" else empty.touch()
         late = indices.lags
         lags = (late.features, late.sensor_s, late.state_s)
