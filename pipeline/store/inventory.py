@@ -273,7 +273,10 @@ def _spec(entry: StoreEntry) -> tuple[str, str]:
     """The first digits of a feature spec's digest, and the entries that tell specs apart."""
     assert entry.attributes is not None
     features, document = entry.specs[FEATURES], entry.attributes.raw["feature_spec"]
-    slots = [f"{slot.pooling} of layer {slot.layer}" for slot in entry.attributes.slots]
+    slots = [
+        f"{slot.pooling} of {'the vision tower' if slot.layer == 'vision' else f'layer {slot.layer}'}"
+        for slot in entry.attributes.slots
+    ]
     settings = {"pooling": " + ".join(dict.fromkeys(slots))}
     settings |= {name: document[name] for name in _SPEC_ENTRIES if document.get(name)}
     return entry.attributes.feature_spec.digest[:8], ", ".join(
