@@ -273,9 +273,10 @@ def _spec(entry: StoreEntry) -> tuple[str, str]:
     """The first digits of a feature spec's digest, and the entries that tell specs apart."""
     assert entry.attributes is not None
     features, document = entry.specs[FEATURES], entry.attributes.raw["feature_spec"]
+    layers = [slot.layer for slot in entry.attributes.slots]
+    named = ["the vision tower" if layer == "vision" else f"layer {layer}" for layer in layers]
     slots = [
-        f"{slot.pooling} of {'the vision tower' if slot.layer == 'vision' else f'layer {slot.layer}'}"
-        for slot in entry.attributes.slots
+        f"{slot.pooling} of {n}" for slot, n in zip(entry.attributes.slots, named, strict=True)
     ]
     settings = {"pooling": " + ".join(dict.fromkeys(slots))}
     settings |= {name: document[name] for name in _SPEC_ENTRIES if document.get(name)}
