@@ -51,6 +51,13 @@ class Variant:
     """How often a training is rolled out, at equal distances, the last time at its end."""
 
 
+_TOKENS: Final = (
+    "vlm.image_resize_height=224",
+    "vlm.image_resize_width=224",
+    "vlm.pooling=[tokens]",
+    "extract.dtype=int8",
+)
+_POOLER: Final = ("train_head.feature_encoder={kind: pooler}",)
 VARIANTS: Final[dict[str, Variant]] = {
     "protocol": Variant(evaluations=3),
     "one policy": Variant(joint=True),
@@ -59,6 +66,8 @@ VARIANTS: Final[dict[str, Variant]] = {
     "224 pixels": Variant(
         features=("vlm.image_resize_height=224", "vlm.image_resize_width=224", "vlm.grid=[8, 8]")
     ),
+    "tokens": Variant(features=_TOKENS, policy=_POOLER),
+    "vision": Variant(features=(*_TOKENS, "vlm.layers=[vision]"), policy=_POOLER),
     "features off": Variant(policy=("train_head.features_enabled=false",)),
     "state off": Variant(policy=("train_head.robot_state_enabled=false", "train_head.anchor=none")),
     "reuse 1": Variant(features=("data.vlm_reuse_count=1",)),
