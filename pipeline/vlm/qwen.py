@@ -27,7 +27,7 @@ from pipeline.vlm.pooling import pool
 from pipeline.vlm.preparation import PreparedRow, TokenLayout
 from pipeline.vlm.processor import PixelSettings
 from pipeline.vlm.slots import Slot
-from pipeline.vlm.vision import VisionTower
+from pipeline.vlm.vision import VisionTower, pad_mlps
 
 _SHAPES = 64
 """Most batch shapes that are compiled: tried sizes times prompt lengths times views."""
@@ -200,6 +200,8 @@ class FrozenVLM:
     ) -> None:
         """Wrap an inner `Qwen2_5_VLModel` that is already on its device."""
         self._model = model
+        if model.device.type == "cuda":
+            pad_mlps(model.visual)
         self._extractor = Extractor(model, settings, spec.slots, compiled)
         self._spec = spec
         self._storage_dtype: str = spec.document["storage_dtype"]

@@ -9,7 +9,7 @@ from transformers import Qwen2_5_VLForConditionalGeneration
 
 from pipeline.vlm.processor import PixelSettings
 from pipeline.vlm.qwen import Extractor, patchify
-from pipeline.vlm.vision import VisionTower
+from pipeline.vlm.vision import VisionTower, pad_mlps
 
 CPU = torch.device("cpu")
 SIZES = [(112, 112), (112, 140), (140, 196), (56, 56), (252, 112)]
@@ -116,3 +116,17 @@ def test_a_batch_asks_nothing_of_its_device(extractor, make_frame, monkeypatch):
     assert valid.device.type == "cpu"
     with pytest.raises((RuntimeError, NotImplementedError)):
         features.sum().item()
+
+
+def test_padded_mlps_give_the_same(load, demo_checkpoint):
+    settings = PixelSettings.read(demo_checkpoint, SIZES[0])
+    visual = load().visual.requires_grad_(False)
+    for block in visual.blocks:  # a width that is no multiple of 64
+        for layer in (block.mlp.gate_proj, block.mlp.up_proj):
+            layer.weight.data, layer.bias.data = layer.weight[:-4], layer.bias[:-4]
+        block.mlp.down_proj.weight.data = block.mlp.down_proj.weight[:, :-4]
+    patches = patchify(images(2, SIZES[0]), settings)
+    before = ours(VisionTower(visual, settings.grid), patches, 2)
+    pad_mlps(visual)
+    assert {len(block.mlp.up_proj.weight) % 64 for block in visual.blocks} == {0}
+    torch.testing.assert_close(ours(VisionTower(visual, settings.grid), patches, 2), before)
