@@ -18,9 +18,12 @@ from pipeline.look.page.blocks import Picture, Report, Section, Text
 from pipeline.look.page.style import PALETTE, finish, panels
 from pipeline.look.page.writing import write_report
 from pipeline.policy.checkpoint import find_policy, load_policy
+from pipeline.simulation.meta_world import HZ, INSTRUCTIONS
 
 PUBLISHED: Final = {"VC-1 base": "85.3 ± 5.2", "VC-1 large": "88.8 ± 2.2", "Ego4D large": "92.9"}
 """Success in percent on the five tasks, by CortexBench (Majumdar et al. 2023, Table 2)."""
+REUSE: Final = {"reuse 1": 1, "reuse 3": 3, "protocol": 10, "reuse 30": 30}
+"""Variants that differ in `vlm_reuse_count` alone."""
 _RULES: Final = (
     "best: of each training the best of its evaluations, as CortexBench counts, which flatters. "
     "last: the checkpoint at the end. validated: the one that the held-out demonstrations chose. "
@@ -104,12 +107,17 @@ def write_tables(run: Run) -> Path:
     picture = Picture(
         "success", "The last checkpoint, with 95 % intervals.", partial(_draw, by_variant)
     )
+    pictures = [picture]
+    if len([name for name in by_variant if name in REUSE]) > 1:
+        drawn = partial(_draw_reuse, by_variant)
+        told = "Ticks of 12.5 ms that share a pass of the model; last checkpoints, 95 % intervals."
+        pictures.append(Picture("reuse", told, drawn))
     report = Report(
         "Meta-World by CortexBench's protocol",
         "Frozen features of a vision-language model on tasks that this project did not make.",
         [],
         (
-            Section("Success", [Text(_RULES), picture, *tables, beside]),
+            Section("Success", [Text(_RULES), *pictures, *tables, beside]),
             Section("Films", [Text(f"Each policy's page is in {run.out / 'policies'}.")]),
         ),
     )
@@ -140,6 +148,28 @@ def _draw(by_variant: dict[str, list[Judged]]) -> Figure:
     axis.set_yticklabels(labels)
     axis.invert_yaxis()
     finish(figure, axis, 4, "Success of the last checkpoint")
+    return figure
+
+
+def _draw_reuse(by_variant: dict[str, list[Judged]]) -> Figure:
+    own = {REUSE[name]: policies for name, policies in by_variant.items() if name in REUSE}
+    shared = [task for task in INSTRUCTIONS if all(task in _tasks(p) for p in own.values())]
+    figure, axis = panels(6.0, 3.4, 1, 1)
+    for place, label in enumerate([*shared, f"mean of {len(shared)}"]):
+        tasks = [label] if label in shared else shared
+        rates = [
+            SuccessRate.of([s for p in own[ticks] if p.task in tasks for s in p.last])
+            for ticks in sorted(own)
+        ]
+        middle = np.array([100 * rate.rate for rate in rates])
+        bars = [middle - [100 * r.low for r in rates], [100 * r.high for r in rates] - middle]
+        moved = np.array(sorted(own)) * 1.03 ** (place - 1)  # so that intervals stay apart
+        style = {"color": PALETTE[place], "label": label, "marker": "o", "capsize": 2}
+        axis.errorbar(moved, middle, yerr=np.maximum(bars, 0), **style)
+    axis.set(xscale="log", ylim=(0, 104), xlabel="control ticks a pass", ylabel="success [%]")
+    axis.set_xticks(sorted(own), [f"{n}\n{HZ / n:.3g} a second" for n in sorted(own)], minor=False)
+    axis.minorticks_off()
+    finish(figure, axis, 1, "Success against vlm_reuse_count")
     return figure
 
 
