@@ -16,7 +16,7 @@ from pipeline.base.config import Params
 from pipeline.base.digests import ContentDigests
 from pipeline.data.episode import RowFrames, RowRange
 from pipeline.extract.engine import RANGE_ROWS
-from pipeline.extract.layout import build_arrays, finish_layout, lay_out
+from pipeline.extract.layout import build_arrays, lay_out
 from pipeline.extract.survey import CheckedEpisode, Survey, sound_episodes, survey
 from pipeline.simulation.demo_recordings import TASK
 from pipeline.simulation.insertion_formats import write_raw
@@ -88,7 +88,6 @@ def _laid_out(surveyed: Survey, checked: Sequence[CheckedEpisode]) -> StoreBuild
     build = StoreBuild(surveyed.target, build_arrays(checked, surveyed), surveyed.plan)
     shutil.rmtree(build.part, ignore_errors=True)
     lay_out(build, checked, surveyed, [])
-    finish_layout(build, checked, surveyed)
     return build
 
 

@@ -19,8 +19,6 @@ from stages.command import Shorthand, run
 
 if TYPE_CHECKING:
     from pipeline.base.config import Params
-    from pipeline.base.text import Table
-    from pipeline.store.archive import Manifest
 
 SECTIONS = ("archive",)
 SHORTHANDS = (Shorthand("--restore", "archive.restore", "make the store from its archive"),)
@@ -28,7 +26,9 @@ SHORTHANDS = (Shorthand("--restore", "archive.restore", "make the store from its
 
 def main(params: "Params") -> None:
     """Archive or restore, and report."""
+    from pipeline.base.text import size
     from pipeline.store.archive import archive, restore
+    from pipeline.store.inventory import bytes_on_disk
 
     store, output = _places(params)
     begun = time.perf_counter()
@@ -36,32 +36,15 @@ def main(params: "Params") -> None:
         restore(output, store, params.archive.threads)
         print(f"{store}: as archived in {output}, {time.perf_counter() - begun:.1f} s")
         return
-    manifest = archive(store, output, params.archive.level, params.archive.threads)
-    if manifest is None:
+    raw = archive(store, output, params.archive.level, params.archive.threads)
+    if raw is None:
         print(f"{output}: there already, of this very store; nothing to do")
         return
-    seconds = time.perf_counter() - begun
-    raw, stored = manifest.raw_bytes / 1e6, manifest.stored_bytes / 1e6
-    print(*_table(manifest).text(), sep="\n")
+    seconds, stored = time.perf_counter() - begun, bytes_on_disk(output)
     print(
-        f"{output}: {raw:.1f} MB in {stored:.1f} MB ({raw / stored:.2f} : 1), {seconds:.1f} s "
-        f"({raw / seconds:.0f} MB/s)"
+        f"{output}: {size(raw)} in {size(stored)} ({raw / stored:.2f} : 1), {seconds:.1f} s "
+        f"({size(raw / seconds)}/s)"
     )
-
-
-def _table(manifest: "Manifest") -> "Table":
-    """Each array: size, how much smaller it became, codec."""
-    from pipeline.base.text import Table
-
-    sizes = [
-        (name, array.raw_bytes, sum(array.shard_bytes), array.codec)
-        for name, array in manifest.arrays.items()
-    ]
-    rows = [
-        (name, raw / 1e6, raw / stored if stored else None, codec)  # zeros have no shard
-        for name, raw, stored, codec in sizes
-    ]
-    return Table(("array", "MB", "ratio", "codec"), rows)
 
 
 def _places(params: "Params") -> tuple[Path, Path]:

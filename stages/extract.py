@@ -43,20 +43,9 @@ def main(params: "Params") -> None:
     """Extract and report."""
     from pipeline.extract.run import extract
 
-    store = params.extract.store
     report = extract(params, say=print)
     if report is not None:
-        rate = report.computed / report.seconds if report.seconds else 0.0
-        print(
-            f"{store}: {report.rows} rows, {report.computed} computed ({rate:.1f} rows/s), "
-            f"{report.taken} taken over, {report.repeated} equal to another"
-        )
-        speed = report.speed
-        if speed.model_share is not None and speed.waited_share is not None:
-            print(
-                f"the model worked {speed.model_share:.0%} of the time and waited "
-                f"{speed.waited_share:.0%} for frames"
-            )
+        print(f"{params.extract.store}: " + "\n".join(report.lines()))
 
 
 if __name__ == "__main__":

@@ -3,11 +3,10 @@
   python -m stages.store list                           sizes, specs, who depends on what
   python -m stages.store merge A.zarr B.zarr --into C.zarr
                                                         one store of several, nothing computed
-  python -m stages.store gc                             what nothing needs, and why
-  python -m stages.store gc --remove                    remove it; never a finished store, nor
-                                                        what a living process is building, nor an
-                                                        unfinished build that holds rows
-  python -m stages.store gc A.zarr.part --remove        remove that one, its rows too
+  python -m stages.store gc                             what stopped builds left
+  python -m stages.store gc --remove                    remove the builds that hold no rows
+  python -m stages.store gc A.zarr.part --remove        remove that build, or A.zarr.previous, with
+                                                        its rows; never a finished store
 
 list and gc without --remove write nothing. Next after a merge: python -m stages.verify
 """
@@ -21,7 +20,6 @@ from stages.command import Shorthand, run
 
 if TYPE_CHECKING:
     from pipeline.base.config import Params, StoresParams
-    from pipeline.base.errors import PipelineError
     from pipeline.store.inventory import StoreEntry
 
 SECTIONS = ("stores",)
@@ -30,7 +28,7 @@ SHORTHANDS = (
     Shorthand(
         "inputs",
         "stores.inputs",
-        "the stores to merge; the unfinished builds that gc removes",
+        "the stores to merge; the builds that gc removes",
         "STORE",
         "*",
     ),
@@ -93,41 +91,29 @@ def _merge(params: "StoresParams") -> None:
 
 
 def _gc(params: "StoresParams") -> None:
-    from pipeline.base.errors import StoreLocked
     from pipeline.base.text import size
-    from pipeline.store.inventory import (
-        describe_kept,
-        fate_of,
-        find_named,
-        list_stores,
-        remove_entry,
-    )
+    from pipeline.store.border import gc_command
+    from pipeline.store.inventory import is_unneeded, leftover, list_stores, remove_leftover
 
-    if params.inputs:
-        folders = dict.fromkeys(path.parent for path in params.inputs)
-        entries = [entry for at in folders for entry in list_stores(at, subfolders=False)]
-        leftovers = find_named(entries, params.inputs)
-    else:
-        entries = list_stores(params.folder)
-        leftovers = [entry for entry in entries if fate_of(entry)[0] == "unneeded"]
-        for line in describe_kept(entries):
-            print(f"kept: {line}")
-    locked: list[PipelineError] = []
-    for entry in leftovers:
-        word, (fate, why) = "removed" if params.remove else "unneeded", fate_of(entry)
-        try:
-            if params.remove and not remove_entry(entry, fate):
+    leftovers = [leftover(path) for path in params.inputs]
+    if not params.inputs:
+        for entry in list_stores(params.folder):
+            if entry.kind not in ("build", "previous"):
                 continue
-            print(f"{word}: {entry.path}, {size(entry.bytes)}: {why}")
-        except StoreLocked as error:
-            locked.append(error)
+            if is_unneeded(entry):
+                leftovers.append(entry)
+            else:
+                why = entry.damage or f"{entry.done} feature rows"
+                print(f"kept: {entry.path}: {why}; {gc_command(entry.path)} removes it")
+    for entry in leftovers:
+        if params.remove:
+            remove_leftover(entry)
+        what = "removed" if params.remove else "unneeded"
+        print(f"{what}: {entry.path}, {size(entry.bytes)}, {entry.done} feature rows")
     if not leftovers:
         print(f"{params.folder}: nothing to remove")
     elif not params.remove:
-        freed = size(sum(entry.bytes for entry in leftovers))
-        print(f"{freed} in {len(leftovers)} place(s); --remove removes them")
-    if locked:
-        raise locked[0]
+        print("--remove removes what is unneeded")
 
 
 if __name__ == "__main__":

@@ -1,20 +1,21 @@
-"""Check a finished store: structure, files, the checksum of every row, NaN in features.
+"""Check a finished store: structure, files, the checksum of every row.
 
 Reads every byte of verify.store (extract.store if null) and says what is wrong and where. The exit
 code is 0 if the store is sound, else 2; then it lists all errors and what to run next.
 
   python -m stages.verify                   check
   python -m stages.verify --reextract 100   also compute 100 random rows again and compare them
-  python -m stages.verify --repair          begin a new build without what is damaged, which
-                                            stages.extract then completes
+  python -m stages.verify --repair          make the store again where it is damaged: sound rows are
+                                            kept, the others are computed
   python -m stages.verify --checkpoint      no store: prove that the model of vlm gives the features
                                             that the head of train_head.output was trained on
   python -m stages.verify --checkpoint DIR  of another head
 
-It never writes to the store itself.
+A damaged store stays until its repair is complete.
 """
 
 from functools import partial
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from stages.command import Shorthand, run
@@ -25,7 +26,7 @@ if TYPE_CHECKING:
 SECTIONS = ("verify",)
 SHORTHANDS = (
     Shorthand("--reextract", "verify.reextract", "random rows to compute again", value="N"),
-    Shorthand("--repair", "verify.repair", "begin a new build without what is damaged"),
+    Shorthand("--repair", "verify.repair", "make a damaged store again; keep its sound rows"),
     Shorthand(
         "--checkpoint",
         "verify.checkpoint",
@@ -40,7 +41,6 @@ def main(params: "Params") -> None:
     """Check the store, and repair it or compute rows again if requested; raises on errors."""
     from pipeline.base.errors import NumericsError, StoreIncomplete
     from pipeline.extract.reextract import reextract
-    from pipeline.extract.repair import repair
     from pipeline.store.border import mend
     from pipeline.store.verification import verify
 
@@ -48,14 +48,14 @@ def main(params: "Params") -> None:
         _prove(params)
         return
     store = params.verify.store or params.extract.store
-    checked = verify(store, params.verify.threads, params.verify.workers)
+    checked = verify(store)
     print(checked.summary())
     if not checked.sound:
         if not params.verify.repair:
             lines = [f"{store}: the store is damaged:", *checked.lines(), mend(store)]
             raise StoreIncomplete("\n".join(lines))
         print("\n".join(checked.lines()))
-        repair(checked, params, print)
+        _repair(store, params)
         return
     print(f"{store}: sound")
     if params.verify.reextract:
@@ -64,6 +64,15 @@ def main(params: "Params") -> None:
         if computed.beyond:
             lines = [f"{store}: rows are not what they would be today:", *computed.refusals()]
             raise NumericsError("\n".join(lines))
+
+
+def _repair(store: Path, params: "Params") -> None:
+    from pipeline.extract.run import extract
+
+    own = params.extract.model_copy(update={"store": store, "plan": False})
+    report = extract(params.model_copy(update={"extract": own}), print, repair=True)
+    if report is not None:
+        print(f"{store}: repaired: " + "\n".join(report.lines()))
 
 
 def _prove(params: "Params") -> None:

@@ -103,7 +103,5 @@ class Issue:
     """None where it concerns the whole stream."""
     stop_s: float | None = None
     file: Path | None = None
-    chunk: int | None = None
-    """The chunk of the array, if it concerns only one chunk file."""
     remedy: str = ""
     """What to install, set or run."""

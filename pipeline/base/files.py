@@ -58,7 +58,7 @@ class OutputKind:
 
     def owns(self, path: Path) -> bool:
         """Whether this project may replace what lies at `path` as one of this kind."""
-        return self.is_one(path) or (path.is_dir() and (self.marks(path) or _is_empty(path)))
+        return (path.is_dir() and (self.marks(path) or _is_empty(path))) or self.is_one(path)
 
     def marks(self, path: Path) -> bool:
         """Whether `path` has the marker of this kind."""

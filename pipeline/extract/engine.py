@@ -85,6 +85,20 @@ class ExtractionReport:
     seconds: float
     speed: Speed
 
+    def lines(self) -> list[str]:
+        """The report in lines for people."""
+        rate = self.computed / self.seconds if self.seconds else 0.0
+        lines = [
+            f"{self.rows} rows, {self.computed} computed ({rate:.1f} rows/s), {self.taken} taken "
+            f"over, {self.repeated} equal to another"
+        ]
+        if self.speed.model_share is not None and self.speed.waited_share is not None:
+            lines.append(
+                f"the model worked {self.speed.model_share:.0%} of the time and waited "
+                f"{self.speed.waited_share:.0%} for frames"
+            )
+        return lines
+
 
 def fill(
     build: StoreBuild,

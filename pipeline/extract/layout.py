@@ -1,6 +1,5 @@
 """Write everything of a store that needs no model: streams, ticks, episodes."""
 
-import json
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from itertools import takewhile
@@ -11,8 +10,7 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from pipeline.base.arrays import first_non_finite
-from pipeline.base.border import MOST_BYTES, Border
-from pipeline.base.errors import DiskFull, NumericsError, RecordingError
+from pipeline.base.errors import ConfigError, DiskFull, NumericsError
 from pipeline.base.files import free_bytes
 from pipeline.base.source import tuned_on_attributes
 from pipeline.base.text import size
@@ -20,30 +18,11 @@ from pipeline.data import Stream
 from pipeline.data.timeline import Timeline, tick_hz
 from pipeline.extract.state import store_bytes
 from pipeline.extract.survey import CheckedEpisode, Survey, embodiment_of
-from pipeline.store import SCHEMA, RowSource, Sizes, StoreBuild, arrays
-from pipeline.store.border import StoreAttributes
+from pipeline.store import FEATURES, SCHEMA, RowSource, Sizes, StoreBuild, arrays
 from pipeline.store.episodes import episode_arrays
-from pipeline.store.schema import ArraySpec, array_of
+from pipeline.store.schema import MOST_ROW_BYTES, ArraySpec
 from pipeline.vlm.checkpoint_folder import tuned_on
 from pipeline.vlm.feature_spec import FeatureSpec
-
-_READERS = Border(
-    RecordingError,
-    "No reader would take the store: give it fewer or shorter names of channels and views, or "
-    "fewer vlm.layers, vlm.pooling slots or vlm.variants.",
-)
-
-
-def check_readable(build: StoreBuild, checked: Sequence[CheckedEpisode], survey: Survey) -> None:
-    """Raise `RecordingError` where readers would refuse the attributes of the store."""
-    where = build.target / "zarr.json"
-    text = json.dumps(_attributes(checked, survey) | {"plan": build.plan}, indent=2)
-    if len(text) > MOST_BYTES // 2:  # golden rows and environments are added later
-        why = f"expected attributes of at most {MOST_BYTES // 2:,} bytes, found {len(text):,}"
-        raise _READERS.refusal(where, why)
-    StoreAttributes.of(build.target, _READERS.parse_json(text, dict[str, Any], where), _READERS)
-    for name, spec in build.specs.items():
-        array_of(spec.document, name, build.target / name / "zarr.json", _READERS)
 
 
 def check_space(
@@ -69,7 +48,7 @@ def lay_out(
 ) -> None:
     """Write streams, ticks and episodes, linking unchanged chunks of a finished store.
 
-    The build is laid out only after `finish_layout`. Raises `DiskFull`.
+    The plan is written last; after that the build can be resumed. Raises `DiskFull`.
     """
     build.create()
     for source, name, rows in _linkable(build, checked, known):
@@ -83,10 +62,6 @@ def lay_out(
     starts = {"sensor": 0, "state": 0}
     for episode in tqdm(checked, "streams", unit="episode", disable=None, leave=False):
         _write_streams(build, episode, starts)
-
-
-def finish_layout(build: StoreBuild, checked: Sequence[CheckedEpisode], survey: Survey) -> None:
-    """Write checksums and attributes, the plan last; after that a build can be resumed."""
     attributes = _attributes(checked, survey)
     build.finish_layout(attributes, {"slots": attributes["slots"]})
 
@@ -111,7 +86,13 @@ def build_arrays(checked: Sequence[CheckedEpisode], survey: Survey) -> dict[str,
         channel=len(embodiment.sensor.names),
         state_dim=len(embodiment.state.names),
     )
-    return arrays(sizes, extract.dtype, extract.sensor_dtype)
+    specs = arrays(sizes, extract.dtype, extract.sensor_dtype)
+    if (row_bytes := specs[FEATURES].row_bytes) > MOST_ROW_BYTES:
+        raise ConfigError(
+            f"a row of features would take {size(row_bytes)}, and no reader takes more than "
+            f"{size(MOST_ROW_BYTES)}. Set fewer vlm.layers, vlm.pooling slots or vlm.variants."
+        )
+    return specs
 
 
 def _linkable(
@@ -123,7 +104,7 @@ def _linkable(
     linked.
     """
     for source in known:
-        if source.path == build.target:
+        if source.path == build.target and not source.damaged:
             pairs = zip(source.texts, checked, strict=False)
             same = [*takewhile(lambda pair: pair[0].content == pair[1].fields["content"], pairs)]
             for stream in ("sensor", "state"):

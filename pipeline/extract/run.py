@@ -1,6 +1,5 @@
 """Recordings x frozen model -> store: survey -> state -> layout -> engine -> seal."""
 
-import errno
 from collections.abc import Generator, Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
@@ -9,19 +8,21 @@ import numpy as np
 
 from pipeline.base.config import Params
 from pipeline.base.digests import ContentDigests, ledger_path
+from pipeline.base.errors import StoreMismatch
 from pipeline.base.machine import resolve_device
 from pipeline.base.text import capped
 from pipeline.data.timeline import rate_notes
 from pipeline.extract.engine import Executor, ExtractionReport, compute_here, fill
-from pipeline.extract.layout import (
-    build_arrays,
-    check_readable,
-    check_space,
-    finish_layout,
-    lay_out,
-)
+from pipeline.extract.layout import build_arrays, check_space, lay_out
 from pipeline.extract.rows import keep_golden
-from pipeline.extract.state import Say, StorePlaces, count_known, plan_lines, row_sources
+from pipeline.extract.state import (
+    BuildState,
+    Say,
+    StorePlaces,
+    count_known,
+    plan_lines,
+    row_sources,
+)
 from pipeline.extract.survey import (
     MOST_EPISODES,
     CheckedEpisode,
@@ -34,90 +35,81 @@ from pipeline.store import FEATURES, FeatureStore, RowSource, StoreBuild, build_
 from pipeline.store.paths import refuse_foreign_store
 
 
-def extract(params: Params, say: Say) -> ExtractionReport | None:
+def extract(params: Params, say: Say, repair: bool = False) -> ExtractionReport | None:
     """Make `extract.store` hold exactly what `params` describe; None where it already does.
 
     Resumes an interrupted build of the same plan, takes known rows from stores and builds of the
-    same feature spec, and computes the rest. With `extract.plan` it only prints what it would do.
+    same feature spec, and computes the rest. With `extract.plan` it only prints what it would do. A
+    `repair` makes a store of these very params again and takes its sound rows.
     """
     target, only_plan = params.extract.store, params.extract.plan
-    with _opened(target, only_plan) as (digests, unwritable):
+    with _opened(target, only_plan) as digests:
         places = StorePlaces(target)
-        surveyed, checked = _survey(params, digests, places)
-        state = places.state(surveyed.plan)
+        surveyed, checked, state = _survey(params, digests, places, repair)
         for line in _survey_lines(surveyed):
             say(line)
         if state == "current":
             FeatureStore.open(target)  # refuses a store that changed after sealing
-            if not only_plan and unwritable is None:
-                places.drop_previous(surveyed)
             say(f"{target}: up to date, nothing to do (stages.verify reads what it holds)")
             return None
-        if unwritable is not None:
-            raise unwritable
-        resumes = state == "resume"
-        build = places.begun_build() if resumes else _new_build(surveyed, checked, places, say)
+        if state == "resume":
+            build = places.begun_build()
+            missing, sources = build.missing(), list[RowSource]()
+            known = build.specs[FEATURES].shape[0] - len(missing)
+        else:
+            build = _new_build(surveyed, checked, places, say)
+            missing = np.arange(build.specs[FEATURES].shape[0])
+            begun = [] if places.begun is None else [places.part]
+            sources = row_sources([*begun, *places.known], surveyed)
+            known = count_known(checked, surveyed, sources)
         with closing(build):
-            rows = build.specs[FEATURES].shape[0]
-            if resumes:
-                missing, known = build.missing(), [RowSource(places.part)]
-                taken = rows - len(missing)
-            else:
-                begun = [] if places.begun is None else [places.part]
-                missing, known = np.arange(rows), row_sources([*begun, *places.known], surveyed)
-                taken = count_known(checked, surveyed, known)
-            for line in plan_lines(build, surveyed, digests, places, state, known, taken):
+            for line in plan_lines(build, surveyed, digests, places, state, known):
                 say(line)
             if only_plan:
                 return None
-            if not resumes:
-                check_space(build, checked, known)
-                if taken < rows:
-                    _check_workers(surveyed)
+            if state == "new":
+                check_space(build, checked, sources)
                 # From here on, no check refuses the run.
                 places = places.set_build_aside(surveyed, say)
                 lay_out(build, checked, surveyed, row_sources(places.known, surveyed))
-                finish_layout(build, checked, surveyed)
-            known = row_sources(places.known, surveyed)
-            report = fill(build, surveyed, known, digests, missing, _executor(surveyed))
+            sources = row_sources(places.known, surveyed)
+            report = fill(build, surveyed, sources, digests, missing, _executor(surveyed))
             keep_golden(build, surveyed, places.stores, say)
             places.put_in_place(build, surveyed, say)
         return report
 
 
 @contextmanager
-def _opened(target: Path, only_plan: bool) -> Generator[tuple[ContentDigests, OSError | None]]:
-    """The digests kept beside the store, and the store's lock while the context is open.
-
-    Also the error if nothing can be written there: a store that is up to date needs no write.
-    """
-    read, unwritable = ContentDigests.to_read, None
+def _opened(target: Path, only_plan: bool) -> Generator[ContentDigests]:
+    """The digests kept beside the store, and the store's lock while the context is open."""
     with ExitStack() as stack:
         if only_plan:
             refuse_foreign_store(target)
+            digests = ContentDigests.to_read(ledger_path(target))
         else:
-            try:
-                stack.enter_context(build_lock(target))
-                recover(target)
-                read = ContentDigests
-            except OSError as error:
-                if error.errno not in (errno.EROFS, errno.EACCES, errno.EPERM):
-                    raise
-                unwritable = error
-        yield stack.enter_context(closing(read(ledger_path(target)))), unwritable
+            stack.enter_context(build_lock(target))
+            recover(target)
+            digests = ContentDigests(ledger_path(target))
+        yield stack.enter_context(closing(digests))
 
 
 def _survey(
-    params: Params, digests: ContentDigests, places: StorePlaces
-) -> tuple[Survey, list[CheckedEpisode]]:
-    """The survey; for a new build also its sound episodes, each read completely."""
+    params: Params, digests: ContentDigests, places: StorePlaces, repair: bool
+) -> tuple[Survey, list[CheckedEpisode], BuildState]:
+    """The survey, for a new build its sound episodes, each read completely, and the state."""
     surveyed = survey(params, digests)
-    if surveyed.bad and params.data.on_bad_episode == "stop":
-        sound_episodes(surveyed, digests)  # lists them with everything else that is wrong
-    state = places.state(surveyed.plan)
+    state, checked = places.state(surveyed.plan, repair), list[CheckedEpisode]()
     if state != "current":
         resolve_device(params.extract.device)
-    return sound_episodes(surveyed, digests) if state == "new" else (surveyed, [])
+    if state == "new" or (surveyed.bad and params.data.on_bad_episode == "stop"):
+        surveyed, checked = sound_episodes(surveyed, digests)  # lists everything that is wrong
+        state = places.state(surveyed.plan, repair)
+    if repair and places.finished != surveyed.plan:
+        raise StoreMismatch(
+            f"{places.target}: expected the params that it was extracted with, found those of "
+            "another store. Give them with --params, or move it away and extract (or merge) anew."
+        )
+    return surveyed, checked, state
 
 
 def _new_build(
@@ -127,17 +119,7 @@ def _new_build(
     places.refuse_to_lose(surveyed, embodiment_of(checked))
     for line in _timeline_lines(surveyed, checked):
         say(line)
-    build = StoreBuild(places.target, build_arrays(checked, surveyed), surveyed.plan)
-    check_readable(build, checked, surveyed)
-    return build
-
-
-def _check_workers(surveyed: Survey) -> None:
-    """Raise `ConfigError` where `extract.workers` is an address that no scheduler answers at."""
-    if isinstance(surveyed.extract.workers, str):
-        from pipeline.extract.cluster import check_scheduler  # dask: a second to import
-
-        check_scheduler(surveyed.extract.workers)
+    return StoreBuild(places.target, build_arrays(checked, surveyed), surveyed.plan)
 
 
 def _executor(surveyed: Survey) -> Executor:

@@ -6,8 +6,8 @@ which is printed before anything is done.
     new       a part is laid out, and its rows are filled in
 
 A part of another plan is set aside within the new one (`pipeline.store.paths`). A run takes rows by
-key from every store and build that is there, and computes the rest. A part with the same plan as
-the store beside it is a repair, which lacks the damaged rows of that store.
+key from every store and build that is there, and computes the rest. So a repair is a new build of
+the store's own plan: whatever is damaged is not taken.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -16,7 +16,6 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
 
-from pipeline.base.config import setting
 from pipeline.base.differences import describe, differences
 from pipeline.base.digests import ContentDigests
 from pipeline.base.errors import StoreIncomplete, StoreMismatch
@@ -39,36 +38,22 @@ class StorePlaces:
     """What is at the three places of a store.
 
     `begun` and `finished` are the plans of the build and of the store, None where there is none.
-    `aside` has the interrupted builds of other plans, `stores` the store and the previous one if
-    they exist. A user's own copy in the previous store's place does not count.
+    `known` has the interrupted builds of other plans, then `stores`: the store and the previous one
+    if they exist. A user's own copy in the previous store's place does not count.
     """
 
     def __init__(self, target: Path) -> None:
         self.target, self.part, self.previous = target, part_path(target), previous_path(target)
         self.begun, self.finished = read_plan(self.part), read_plan(target)
-        self.aside = builds_aside(target)
         self.kept = KEPT.owns(self.previous) and read_plan(self.previous) is not None
         self.stores = [target] * (self.finished is not None) + [self.previous] * self.kept
+        self.known = [*builds_aside(target), *self.stores]
 
-    def state(self, plan: str) -> BuildState:
-        """The state for a run of this plan."""
+    def state(self, plan: str, repair: bool = False) -> BuildState:
+        """The state for a run of this plan; a `repair` makes the store of this plan again."""
         if self.begun == plan:
             return "resume" if self.layout_damage is None else "new"
-        return "current" if self.finished == plan else "new"
-
-    @property
-    def repaired(self) -> bool:
-        """Whether a repair of the store has begun, in a part of its own plan."""
-        plans = {self.begun, *(read_plan(place) for place in self.aside)}
-        return self.finished is not None and self.finished in plans
-
-    @property
-    def known(self) -> list[Path]:
-        """The builds and stores from which a build takes rows, without its own part.
-
-        After a repair has begun, stores are left out: their damage must not come back.
-        """
-        return self.aside if self.repaired else [*self.aside, *self.stores]
+        return "current" if self.finished == plan and not repair else "new"
 
     @cached_property
     def layout_damage(self) -> str | None:
@@ -90,41 +75,30 @@ class StorePlaces:
                 say(f"the unfinished build {self.part} is given up: {line}")
         return StorePlaces(self.target)
 
-    def keeping_note(self, surveyed: Survey) -> list[str]:
-        """What happens to the store and the previous one if the run lacks some of their rows.
+    def keeping_note(self, surveyed: Survey) -> Iterator[str]:
+        """What happens to the store and the previous one.
 
-        Raises `ConfigError` where something else lies in the previous store's place.
+        Raises `ConfigError` where the store must be kept and something else lies in the previous
+        store's place.
         """
-        lost, contents, lines = self._lost(surveyed), surveyed.contents, list[str]()
-        other = lost is None and self._may_have_other_rows(surveyed)
-        if lost and self.finished:
-            refuse_foreign(self.previous, KEPT)
-            lines.append(
-                f"{self.target} holds {lost}: it is kept as {self.previous} until the next "
-                "successful run, which takes their rows from it where they are there again"
-            )
-            contents |= set(_contents(self.target) or ())
-        if other:
-            refuse_foreign(self.previous, KEPT)
-            lines.append(
-                f"{self.target} is kept as {self.previous}, and takes its place on the disk, if it "
-                "holds rows that the new store lacks"
+        if self.finished not in (None, surveyed.plan):
+            if lost := len(_contents(self.target) - surveyed.contents):
+                refuse_foreign(self.previous, KEPT)
+                yield f"{self.target} holds {lost} episode(s) that are not in this run"
+            yield (
+                f"{self.target} is kept as {self.previous} until the next successful run, if it "
+                "holds episodes or rows that the new store lacks"
             )
         if self.kept:
-            known = _contents(self.previous)
-            fate = "kept" if lost else "removed"
-            fate = "replaced by it" if lost and self.finished else fate
-            fate = "removed, or replaced by it," if other else fate
-            gone = "all its" if known is None else sum(content not in contents for content in known)
-            lines.append(
-                f"{self.previous} is {fate} when this run succeeds; {gone} episode(s) are only in "
-                "there"
+            only = len(_contents(self.previous) - surveyed.contents)
+            yield (
+                f"{self.previous} is removed or replaced when this run succeeds; it holds {only} "
+                "episode(s) that are not in this run"
             )
-        return lines
 
     def put_in_place(self, build: StoreBuild, surveyed: Survey, say: Say) -> None:
         """Seal a build; keep the replaced store if it has episodes or rows that the build lacks."""
-        keep = self._lost(surveyed) is not None or self._has_other_rows(surveyed, self.part)
+        keep = self._has_more(surveyed)
         build.seal(keep=keep)
         if keep:
             taken = size(store_bytes(read_specs(self.previous)))
@@ -136,71 +110,56 @@ class StorePlaces:
         elif self.kept:
             remove_folder(self.previous, KEPT)
 
-    def drop_previous(self, surveyed: Survey) -> None:
-        """Remove a previous store that a kill left, if the store has all its episodes and rows."""
-        if not self.kept or not {*(_contents(self.previous) or [""])} <= surveyed.contents:
-            return
-        if not _keys(self.previous) - _keys(self.target):
-            remove_folder(self.previous, KEPT)
+    def _has_more(self, surveyed: Survey) -> bool:
+        """Whether the store to be replaced has episodes or rows that a complete build lacks.
 
-    def _may_have_other_rows(self, surveyed: Survey) -> bool:
-        """Whether the store may have rows that this run does not make."""
-        if self.finished in (None, surveyed.plan) or self.repaired:
-            return False
-        store, here = RowSource(self.target), {episode.digest for episode in surveyed.episodes}
-        other_spec = store.attributes.feature_spec.digest != surveyed.spec.digest
-        return other_spec or not {text.digest for text in store.texts} <= here
-
-    def _has_other_rows(self, surveyed: Survey, build: Path) -> bool:
-        """Whether the store to be replaced has rows that a complete build lacks.
-
-        A store under repair counts as without rows: its damage must not come back.
+        One that cannot be read counts as such. One behind a link is not removed anyway.
         """
-        if not self.stores or read_plan(self.stores[0]) == surveyed.plan or self.repaired:
+        if not self.stores or self.finished == surveyed.plan or self.target.is_symlink():
             return False
-        return bool(_keys(self.stores[0]) - _keys(build))
-
-    def _lost(self, surveyed: Survey) -> str | None:
-        """Which episodes of the existing store are not in this run; None if all are."""
-        if not self.stores or read_plan(self.stores[0]) == surveyed.plan:
-            return None
-        if (known := _contents(self.stores[0])) is None:
-            return "episodes that cannot be read any more"
-        contents = surveyed.contents
-        lost = sum(content not in contents for content in known)
-        what = f"{lost} episode(s) that are not in this run (or whose files are read otherwise now)"
-        return what if lost else None
+        try:
+            before = RowSource(self.stores[0])
+            lost = {text.content for text in before.texts} - surveyed.contents
+            return bool(lost or before.rows.keys() - RowSource(self.part).rows.keys())
+        except StoreIncomplete:
+            return True
 
     def refuse_to_lose(self, surveyed: Survey, embodiment: Embodiment) -> None:
         """Raise `StoreMismatch` where the run would lose rows that these params cannot make again.
 
-        This is so for a merged store, or one under repair, with recordings that the params do not
-        name: a user who follows the advice of a check may run with other params than that store's.
-        It is also so for a store or build that has no episode in common with the run, and another
-        embodiment or only other sources.
+        This is so for a merged store with recordings that the params do not name: a user who
+        follows the advice of a check may run with other params than that store's. It is also so for
+        a store or build that has no episode in common with the run, and another embodiment or only
+        other sources.
         """
-        under_repair = self.finished is not None and self.finished == self.begun
-        # The metadata of a store under repair may be damaged; its build says what it holds.
-        target = None if under_repair else self.finished
-        for place, plan in ((self.target, target), (self.part, self.begun)):
-            if plan is not None:
+        for place, plan in ((self.target, self.finished), (self.part, self.begun)):
+            if plan not in (None, surveyed.plan):
                 _refuse_another(RowSource(place), surveyed, embodiment)
-        if not under_repair and not (self.finished or "").startswith(MERGED):
-            return
-        source = RowSource(self.part if under_repair else self.target)
-        if lost := {text.content for text in source.texts} - surveyed.contents:
-            what = "is under repair" if under_repair else "was merged of others"
+        merged = (self.finished or "").startswith(MERGED)
+        if merged and (lost := _contents(self.target) - surveyed.contents):
             raise StoreMismatch(
-                f"{self.target}: {what} and holds {len(lost)} episode(s) that the params do not "
-                "name. Give the --params it was made with (or run its merge again), name another "
-                "extract.store, or move it away."
+                f"{self.target}: was merged of others and holds {len(lost)} episode(s) that the "
+                "params do not name. Name another extract.store, or move it away."
             )
 
 
 def row_sources(places: Sequence[Path], surveyed: Survey) -> list[RowSource]:
-    """The stores and laid-out builds of the same feature spec among these."""
-    digest, sources = surveyed.spec.digest, map(RowSource, places)
-    return [source for source in sources if source.attributes.feature_spec.digest == digest]
+    """The stores and laid-out builds of the same feature spec among these.
+
+    A store of the run's own plan is under repair: damage in it only keeps rows from being taken.
+    """
+    sources: list[RowSource] = []
+    for path in places:
+        damaged = path == surveyed.target and read_plan(path) == surveyed.plan
+        try:
+            source = RowSource(path, damaged=damaged)
+        except StoreIncomplete:
+            if not damaged:
+                raise
+            continue
+        if source.attributes.feature_spec.digest == surveyed.spec.digest:
+            sources.append(source)
+    return sources
 
 
 def _refuse_another(source: RowSource, surveyed: Survey, embodiment: Embodiment) -> None:
@@ -221,18 +180,10 @@ def _refuse_another(source: RowSource, surveyed: Survey, embodiment: Embodiment)
         )
 
 
-def _contents(store: Path) -> list[str] | None:
-    """The content digest of each episode; None where they can no longer be read."""
+def _contents(store: Path) -> set[str]:
+    """The content digests of the episodes; none where they can no longer be read."""
     try:
-        return [text.content for text in RowSource(store).texts]
-    except StoreIncomplete:
-        return None
-
-
-def _keys(store: Path) -> set[bytes]:
-    """The key of each row of a store or a build; none where they can no longer be read."""
-    try:
-        return set(RowSource(store).rows)
+        return {text.content for text in RowSource(store).texts}
     except StoreIncomplete:
         return set()
 
@@ -254,24 +205,20 @@ def plan_lines(
     digests: ContentDigests,
     places: StorePlaces,
     state: BuildState,
-    sources: Sequence[RowSource],
     known: int,
 ) -> list[str]:
-    """What the extraction will do, line by line; `known` rows need no model.
-
-    `sources` are stores and builds of the same feature spec.
-    """
-    known_digests = {text.digest for source in sources for text in source.texts}
-    unchanged = sum(episode.digest in known_digests for episode in surveyed.episodes)
-    begun = places.begun == surveyed.plan
-    place = places.part if begun or places.repaired else places.target
-    before = None if read_plan(place) is None else RowSource(place)
+    """What the extraction will do, line by line; `known` rows need no model."""
+    before = None
     if state == "resume":
-        doing = "completing the repair" if places.repaired else "continuing the interrupted build"
-        reasons = [f"{doing} {places.part}"]
-    elif begun:
+        reasons = [f"continuing the interrupted build {places.part}"]
+    elif places.begun == surveyed.plan:
         reasons = [f"{places.layout_damage}; streams are laid out again, the feature rows are kept"]
+    elif places.finished == surveyed.plan:
+        reasons = ["the store is damaged; its sound feature rows are kept"]
+    elif places.finished is None:
+        reasons = ["there is no store yet"]
     else:
+        before = RowSource(places.target)
         reasons = _reasons(surveyed, before)
     rows, variants = build.specs[FEATURES].shape[0], surveyed.spec.variants
     left, rows_per_s = rows - known, digests.rate(surveyed.rate_name)
@@ -283,9 +230,9 @@ def plan_lines(
         time = f"about {duration(left / rows_per_s)} at {rows_per_s:.1f} rows/s, as last measured"
     needed, free = size(store_bytes(build.specs)), size(free_bytes(build.part))
     return [
-        *(f"WARNING: {warning}" for warning in _warnings(surveyed, before, left)),
+        *(f"WARNING: {warning}" for warning in _warnings(surveyed, left)),
         *(f"why: {reason}" for reason in reasons),
-        f"episodes: {len(surveyed.episodes)}, {unchanged} of them unchanged",
+        f"episodes: {len(surveyed.episodes)}",
         f"rows: {rows}, {known} known, {left} to compute"
         + (f" in {variants} variants each" if left and variants > 1 else "")
         + (" (fewer where a key turns out to be known)" if left and known else ""),
@@ -300,42 +247,24 @@ def store_bytes(specs: dict[str, ArraySpec]) -> int:
     return sum(spec.data_bytes for spec in specs.values())
 
 
-def _reasons(surveyed: Survey, before: RowSource | None) -> Iterator[str]:
-    """Why the existing store, if any, is not enough."""
-    if before is None:
-        yield "there is no store yet"
-        return
+def _reasons(surveyed: Survey, before: RowSource) -> Iterator[str]:
+    """Why the existing store is not enough."""
     lines = spec_differences(before.attributes.raw["feature_spec"], surveyed.spec.attrs())
     yield from (f"feature spec, {line}" for line in lines)
-    digests = {text.digest for text in before.texts}
-    changed = [episode for episode in surveyed.episodes if episode.digest not in digests]
-    here = {episode.digest for episode in surveyed.episodes}
-    revised = {episode.content for episode in changed}  # these count as changed
-    gone = sum(text.digest not in here and text.content not in revised for text in before.texts)
-    if changed:
+    here, there = ({it.digest for it in episodes} for episodes in (surveyed.episodes, before.texts))
+    if added := len(here - there):
         what = "files, how these are read, instruction, name, place, action_hz or vlm_reuse_count"
-        yield f"{len(changed)} episode(s) are new or have other {what}"
-    if gone:
-        yield f"{gone} episode(s) of the store are gone or changed"
-    if unrated := before.attributes.action_hz is None:
-        yield "the store does not say the rate of its ticks"
-    if not (lines or changed or gone or unrated):
-        yield "extract.sensor_dtype, the order of episodes or how actions are derived changed"
+        yield f"{added} episode(s) are new or have other {what}"
+    if gone := len({text.content for text in before.texts} - surveyed.contents):
+        yield f"{gone} episode(s) of the store are gone"
+    if not (lines or added or gone):
+        yield "extract.sensor_dtype, action_hz, the order of episodes or their actions changed"
 
 
-def _warnings(surveyed: Survey, before: RowSource | None, missing: int) -> Iterator[str]:
+def _warnings(surveyed: Survey, missing: int) -> Iterator[str]:
     """What the user may not intend, each with what to do about it."""
     data, vlm, extract = surveyed.data, surveyed.vlm, surveyed.extract
     recordings, views = surveyed.recordings, surveyed.spec.views
-    known = before.attributes.feature_spec.views if before else []
-    if known and (added := set(views) - set(known)):
-        count = sum(not added.isdisjoint(recording.view_names()) for recording in recordings)
-        kept = setting("data.views", [view for view in known if view in views])
-        yield (
-            f"{count} of {len(recordings)} episode(s) have {', '.join(sorted(added))}, which the "
-            "store does not have. The model sees all views of a store at a time, so that every row "
-            f"of every episode is computed again. To keep the rows: {kept}"
-        )
     if not views and data.views != ():
         yield (
             f"none of the {len(recordings)} episode(s) has a frame, so that every row will hold "

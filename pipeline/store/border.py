@@ -21,7 +21,7 @@ from pipeline.base.source import SlotDocument, SourceDocument, ViewName
 
 Length = Annotated[int, Field(ge=0, le=2**48)]
 KNOWN = ".known"
-"""The folder within a part for interrupted builds of other plans."""
+"""The folder within a part for an interrupted build of another plan."""
 _STORE = re.compile(r"(?P<base>.+?\.zarr)(?:\.part|\.previous)?")
 
 
@@ -46,13 +46,10 @@ def restore_command(archive: Path) -> str:
 def mend(path: Path) -> str:
     """What to do about a damaged store or build; `path` is its folder or a file in it."""
     folder, store = _owner(path)
-    for place in (path, *path.parents):
-        if place.parent.name == KNOWN:
-            return f"Remove {place}, then run {extract_command(store)}."
     if folder != store:
         return f"Remove it with {gc_command(folder)}, then run {extract_command(store)}."
     repair = command("verify", "--repair", setting("verify.store", store))
-    return f"Run {repair}, which keeps what is sound, then what it says."
+    return f"Run {repair}, which keeps what is sound."
 
 
 def start_over(path: Path) -> str:

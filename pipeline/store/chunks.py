@@ -8,10 +8,10 @@ import errno
 import hashlib
 import json
 import os
-import shutil
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Generator, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing, suppress
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +23,7 @@ from tqdm import tqdm
 
 from pipeline.base.border import shown
 from pipeline.base.errors import StoreIncomplete
-from pipeline.base.files import disk_full_named, sync
+from pipeline.base.files import disk_full_named
 from pipeline.store.border import mend, store_border
 from pipeline.store.paths import group_attributes, laid_out_attributes
 from pipeline.store.schema import (
@@ -31,6 +31,7 @@ from pipeline.store.schema import (
     CHECKSUMS,
     FEATURES,
     GROUPS,
+    INCREMENTAL,
     TRAILER_BYTES,
     ArraySpec,
     chunk_path,
@@ -53,6 +54,7 @@ UNSEALED = "expected a seal over metadata and chunks, found none: an earlier ver
 BLOCK_BYTES = 4 * 2**20
 """Bytes read at a time; few enough to be still in the processor's cache when they are checked."""
 _MOST_OPEN = 32
+_THREADS = 4
 
 
 def row_checksums(rows: NDArray[Any]) -> NDArray[np.uint32]:
@@ -72,10 +74,9 @@ def check_row_checksums(
     """Raise `StoreIncomplete` where these feature rows do not give these checksums."""
     bad = np.asarray(rows)[row_checksums(features) != wanted]
     if bad.size:
-        raise StoreIncomplete(
-            f"{chunk_path(store, spec, bad[0] // spec.chunk_rows)}: rows {bad[0]} to {bad[-1]} of "
-            f"{spec.name} do not give their checksum: the store is damaged. {mend(store)}"
-        )
+        path = chunk_path(store, spec, bad[0] // spec.chunk_rows)
+        what = f"{_wrong_rows(spec, bad.tolist())}: the store is damaged"
+        raise store_border(store).refusal(path, what)
 
 
 def note_metadata(root: Path, attributes: Mapping[str, Any] | None = None) -> None:
@@ -85,21 +86,12 @@ def note_metadata(root: Path, attributes: Mapping[str, Any] | None = None) -> No
     zarr.open_group(root, mode="r+").attrs.put({**kept, METADATA_DIGEST: digest})
 
 
-def metadata_damage(root: Path) -> str | None:
-    """What is wrong with the metadata; None where they give their digest.
-
-    Raises `StoreIncomplete` where they cannot be read.
-    """
+def check_metadata(root: Path) -> None:
+    """Raise `StoreIncomplete` where the metadata cannot be read or do not give their digest."""
     attributes = group_attributes(root)
     stored, actual = attributes.get(METADATA_DIGEST), _metadata_digest(root, attributes)
-    if stored == actual:
-        return None
-    return f"the metadata were changed: expected their digest {shown(stored)}, found {actual}"
-
-
-def check_metadata(root: Path) -> None:
-    """Raise `StoreIncomplete` where the metadata of a finished store were changed."""
-    if what := metadata_damage(root):
+    if stored != actual:
+        what = f"the metadata were changed: expected their digest {shown(stored)}, found {actual}"
         raise store_border(root).refusal(root / "zarr.json", what)
 
 
@@ -187,31 +179,64 @@ def check_chunks(root: Path, specs: Iterable[ArraySpec], seal: Seal | None) -> N
 
 
 def find_damage(root: Path, specs: Iterable[ArraySpec], seal: Seal | None = None) -> str | None:
-    """The first chunk file that does not give its trailer or its sealed one, and what is wrong.
+    """The first chunk file that is not as it was written, and what is wrong; else None."""
+    with closing(damages(root, specs, seal)) as found:
+        return next((f"{path}: {what}" for path, what in found), None)
 
-    Raises `StoreIncomplete` where a feature row does not give its checksum. Shows a progress bar on
-    a terminal after one second.
+
+def damages(
+    root: Path, specs: Iterable[ArraySpec], seal: Seal | None = None
+) -> Generator[tuple[Path, str]]:
+    """Each chunk file that is not as it was written, and what is wrong.
+
+    Such a file does not give its trailer, its sealed one or the checksums of its feature rows.
+    Several threads read each file once. Shows a progress bar on a terminal after one second.
     """
     files = [(spec, chunk) for spec in specs for chunk in range(spec.chunk_count)]
-    own = read_spec(root, CHECKSUMS) if any(spec.name == FEATURES for spec, _ in files) else None
-    for spec, chunk in tqdm(files, "checksums", unit="file", leave=False, disable=None, delay=1):
-        path, sealed = chunk_path(root, spec, chunk), sealed_trailer(seal, spec.name, chunk)
-        compare = None
-        if own and spec.name == FEATURES:
-            compare = partial(_compare_rows, root, own, spec, chunk)
-        if damage := read_chunk(path, spec, compare, sealed).damage:
-            return f"{path}: {damage}"
-    return None
+    sums = None
+    if any(spec.name == FEATURES for spec, _ in files):
+        with suppress(StoreIncomplete):  # a damaged file of checksums is named as such
+            sums = read_rows(root, read_spec(root, CHECKSUMS))
+
+    def check(file: tuple[ArraySpec, int]) -> tuple[Path, str]:
+        spec, chunk = file
+        of_rows = sums if spec.name == FEATURES else None
+        sealed = sealed_trailer(seal, spec.name, chunk)
+        return chunk_path(root, spec, chunk), _chunk_damage(root, spec, chunk, sealed, of_rows)
+
+    with ThreadPoolExecutor(_THREADS) as pool:
+        checked = pool.map(check, files)
+        total = len(files)
+        bar = tqdm(checked, "checksums", total, unit="file", leave=False, disable=None, delay=1)
+        try:
+            yield from ((path, what) for path, what in bar if what)
+        finally:
+            pool.shutdown(cancel_futures=True)
 
 
-def _compare_rows(
-    root: Path, own: ArraySpec, spec: ArraySpec, chunk: int, first: int, rows: NDArray[Any]
-) -> None:
-    """Raise `StoreIncomplete` where feature rows do not give the checksums in array `own`."""
-    within = spec.chunk_rows_of(chunk)[first : first + len(rows)]
-    if within:  # the rest is padding
-        wanted = read_rows(root, own, within.start, within.stop)
-        check_row_checksums(root, spec, within, rows[: len(within)], wanted)
+def _chunk_damage(
+    root: Path, spec: ArraySpec, chunk: int, sealed: bytes | None, sums: NDArray[np.uint32] | None
+) -> str:
+    """What is wrong with a chunk file, if anything; `sums` are those of all feature rows."""
+    rows, bad = np.array(spec.chunk_rows_of(chunk)), list[int]()
+
+    def compare(first: int, values: NDArray[Any]) -> None:
+        within = rows[first : first + len(values)]  # the rest is padding
+        if sums is not None and len(within):
+            wrong = row_checksums(values[: len(within)]) != sums[within]
+            bad.extend(within[wrong].tolist())
+
+    what = read_chunk(chunk_path(root, spec, chunk), spec, compare, sealed).damage
+    if not bad:
+        return what or ""
+    return _wrong_rows(spec, bad) if what is None else f"{what}; {_wrong_rows(spec, bad)}"
+
+
+def _wrong_rows(spec: ArraySpec, bad: Sequence[int]) -> str:
+    if len(bad) == 1:
+        return f"row {bad[0]} of {spec.name} does not give its checksum"
+    rows = f"{len(bad)} rows from {bad[0]} to {bad[-1]}"
+    return f"{rows} of {spec.name} do not give their checksums"
 
 
 def read_rows(root: Path, spec: ArraySpec, start: int = 0, stop: int | None = None) -> NDArray[Any]:
@@ -291,15 +316,14 @@ def read_chunk(
 class ChunkFiles:
     """The files of one array of a build, written by row.
 
-    A linked chunk also belongs to another store: `write` skips it, or copies it first when the
-    array is `owned`. Rows of an `owned` array have their own checksums, which the caller compares.
+    A linked chunk of streams, ticks or episodes also belongs to another store: `write` skips it.
     """
 
-    def __init__(self, root: Path, spec: ArraySpec, *, owned: bool = False) -> None:
+    def __init__(self, root: Path, spec: ArraySpec) -> None:
         self._root = root
         self.spec = spec
         self.paths = chunk_paths(root, spec)
-        self._owned = owned
+        self._row_by_row = spec.name in INCREMENTAL
         self._descriptors: dict[int, int] = {}
         self._unsynced: set[int] = set()
         self._sums: dict[int, tuple[int, int]] = {}
@@ -319,7 +343,7 @@ class ChunkFiles:
     def is_linked(self, chunk: int) -> bool:
         """Whether this file also belongs to another store and so must not be written."""
         path = self.paths[chunk]
-        return path.is_symlink() or (path.exists() and path.stat().st_nlink > 1)
+        return not self._row_by_row and path.exists() and path.stat().st_nlink > 1
 
     def link(self, chunk: int, source: Path) -> bool:
         """Take a chunk over from another store as it is; False where files cannot be linked."""
@@ -342,9 +366,7 @@ class ChunkFiles:
         assert start + len(block) <= self.spec.shape[0], (start, len(block), self.spec)
         for chunk, offset, data in _parts(self.spec, start, block):
             if self.is_linked(chunk):
-                if not self._owned:
-                    continue
-                self._unlink(chunk)
+                continue
             with disk_full_named(self.paths[chunk]):
                 descriptor = self._descriptor(chunk)
                 if os.fstat(descriptor).st_size > self.spec.chunk_bytes:
@@ -380,20 +402,19 @@ class ChunkFiles:
     def seal(self) -> None:
         """Compare each chunk with its trailer, or write it where there is none yet.
 
-        A second run changes nothing. A trailer that does not match the rows is written again if the
-        array is `owned`, because after a power loss a file may have its full size without its last
-        bytes. Otherwise raises `StoreIncomplete`; the next run then lays the build out again.
+        A second run changes nothing. A trailer that does not match is written again if the array is
+        written row by row: its rows have checksums of their own, and after a power loss a file may
+        have its full size without its last bytes. Otherwise raises `StoreIncomplete`; the next run
+        then lays the build out again.
         """
-        sealed = self.spec.chunk_bytes + TRAILER_BYTES
         for chunk, path in enumerate(self.paths):
             if self.is_linked(chunk):
-                if path.stat().st_size == sealed:
-                    continue
-                self._unlink(chunk)  # unsealed, so its other name is not a store's
+                continue
             state = read_chunk(path, self.spec)
             if state.damage:
+                has_trailer = path.stat().st_size > self.spec.chunk_bytes
                 whole = state.bytes >= self.spec.chunk_bytes
-                if not whole or (path.stat().st_size == sealed and not self._owned):
+                if not whole or (has_trailer and not self._row_by_row):
                     raise StoreIncomplete(
                         f"{path}: {state.damage}: the disk did not keep what was written. Run the "
                         "same command again: it writes streams, ticks and episodes anew and keeps "
@@ -421,16 +442,6 @@ class ChunkFiles:
         with disk_full_named(self.paths[chunk]):
             _write_all(self._descriptor(chunk), trailer, self.spec.chunk_bytes)
         self._unsynced.add(chunk)
-
-    def _unlink(self, chunk: int) -> None:
-        """Replace a linked file with a copy of it."""
-        self.close()
-        path = self.paths[chunk]
-        copy = path.with_name(path.name + ".partial")
-        with disk_full_named(path):
-            shutil.copyfile(path, copy)
-            sync(copy)
-        copy.replace(path)
 
     def _descriptor(self, chunk: int) -> int:
         if chunk not in self._descriptors:

@@ -18,13 +18,13 @@ from numcodecs import Zstd
 from numpy.typing import NDArray
 from zarr.codecs import BytesCodec, Crc32cCodec, ZstdCodec
 
-from pipeline.base.errors import Issue, StoreIncomplete
+from pipeline.base.errors import StoreIncomplete
 from pipeline.base.files import disk_full_named, sync
 from pipeline.base.source import row_key
 from pipeline.store.border import FrameDocument, StoreAttributes, StoredGolden, store_border
-from pipeline.store.chunks import check_metadata, note_metadata, read_rows
+from pipeline.store.chunks import check_metadata, note_metadata
 from pipeline.store.paths import group_attributes, laid_out_attributes
-from pipeline.store.schema import TRAILER_BYTES, ArraySpec
+from pipeline.store.schema import TRAILER_BYTES
 
 GOLDEN: Final = "golden"
 """The group, and the attribute of the root."""
@@ -88,42 +88,14 @@ def carried_golden(
                 yield replace(golden, row=row)
 
 
-def golden_issues(
-    root: Path, attributes: StoreAttributes, keys: ArraySpec | None
-) -> Iterator[Issue]:
-    """The damage of golden rows; nothing is checked where the keys cannot be read."""
-    if keys is None:
-        return
+def golden_places(attributes: StoreAttributes) -> list[str]:
+    """The folders of the group of golden rows: its own, each row's and each frame's."""
+    if GOLDEN not in attributes.model_fields_set:
+        return []
+    places = [GOLDEN]
     for number, entry in enumerate(attributes.golden):
-        try:
-            key = read_rows(root, keys, entry.row, entry.row + 1)[0]
-        except StoreIncomplete:
-            continue
-        try:
-            _read(root, attributes, number, key)
-        except StoreIncomplete as error:
-            yield Issue(severity="error", kind="golden row", message=str(error), stream=GOLDEN)
-    # Golden rows are read without the groups, but zarr finds them by these alone.
-    for place in _groups(root, attributes):
-        try:
-            store_border(root).check_file(place / "zarr.json")
-        except StoreIncomplete as error:
-            yield Issue(severity="error", kind="golden row", message=str(error), stream=GOLDEN)
-
-
-def _groups(root: Path, attributes: StoreAttributes) -> list[Path]:
-    """The zarr groups of the golden rows that the root attributes list."""
-    rows = [root / GOLDEN / str(number) for number in range(len(attributes.golden))]
-    return [root / GOLDEN, *rows] if "golden" in attributes.model_fields_set else []
-
-
-def golden_files(root: Path, attributes: StoreAttributes) -> set[Path]:
-    """The files of the golden rows that the root attributes list."""
-    groups = _groups(root, attributes)
-    rows = zip(groups[1:], attributes.golden, strict=True)
-    frames = [place / view for place, entry in rows for view in entry.views]
-    chunks = {frame / "c" / "0" / "0" / "0" for frame in frames}
-    return chunks | {place / "zarr.json" for place in (*groups, *frames)}
+        places += [f"{GOLDEN}/{number}", *(f"{GOLDEN}/{number}/{view}" for view in entry.views)]
+    return places
 
 
 def _write_frame(root: Path, name: str, frame: NDArray[np.uint8]) -> None:

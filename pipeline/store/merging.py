@@ -1,10 +1,9 @@
 """Merge finished stores of one feature spec and one embodiment into one, without the model.
 
-The merged store is built like any other: laid out, filled with feature rows and their keys, resumed
-after a kill, and sealed. Nothing is computed. It has a plan of its own, because it cannot know the
-params that would describe all its recordings: `stages.extract` over all the sources lays the store
-out anew, and takes every row from it by key without loading the model. To complete the repair of a
-merged store, merge the same stores again.
+The merged store is built like any other, in one go: nothing is computed, so that a merge that was
+killed begins again. It has a plan of its own, because it cannot know the params that would describe
+all its recordings: `stages.extract` over all the sources lays the store out anew, and takes every
+row from it by key without loading the model.
 """
 
 import hashlib
@@ -42,13 +41,10 @@ from pipeline.store.golden import GOLDEN, GoldenFrames, read_golden
 from pipeline.store.lock import build_lock
 from pipeline.store.paths import (
     MERGED,
-    Inode,
     group_attributes,
-    inode_of,
     part_path,
     read_plan,
     recover,
-    refuse_replaced,
     unfinished_plans,
 )
 from pipeline.store.reader import FeatureStore
@@ -56,7 +52,6 @@ from pipeline.store.schema import (
     ARRAY_NAMES,
     CHECKSUMS,
     FEATURES,
-    INCREMENTAL,
     KEYS,
     POSITIONS,
     STREAMS,
@@ -65,9 +60,7 @@ from pipeline.store.schema import (
 )
 from pipeline.store.writer import StoreBuild, environment_runs
 
-_COPIED = [
-    name for name in ARRAY_NAMES if name.split("/")[0] in STREAMS and name not in INCREMENTAL
-]
+_COPIED = [name for name in ARRAY_NAMES if name.split("/")[0] in STREAMS]
 _BLOCK_BYTES = 32 * 2**20
 
 # Attributes of an input's root that would be wrong in the merged store.
@@ -86,13 +79,13 @@ class EpisodeRun:
     rows: Mapping[str, range]
     shift: Mapping[str, int]
 
-    def blocks(self, name: str, rows: range | None = None) -> Iterator[tuple[range, NDArray[Any]]]:
-        """Rows of an array of the input (by default all of the run) and their values, by block.
+    def blocks(self, name: str) -> Iterator[tuple[range, NDArray[Any]]]:
+        """The run's rows of an array of the input and their values, by block.
 
         Reads with plain system calls, so that a truncated file is an error and not a SIGBUS.
         """
         spec = read_spec(self.store.path, name)
-        rows = self.rows[name.split("/")[0]] if rows is None else rows
+        rows = self.rows[name.split("/")[0]]
         step = max(1, _BLOCK_BYTES // max(1, spec.row_bytes))
         for block in (rows[at : at + step] for at in range(0, len(rows), step)):
             yield block, read_rows(self.store.path, spec, block.start, block.stop)
@@ -193,13 +186,12 @@ def merge(inputs: Sequence[Path], output: Path | None) -> MergedEpisodes | None:
     output = _checked_output(inputs, output)
     with build_lock(output):
         recover(output)
-        inodes = [inode_of(path) for path in inputs]
         stores = [FeatureStore.open(path) for path in inputs]
+        inodes = [path.stat().st_ino for path in inputs]
         _check_alike(stores)
         merged = MergedEpisodes(stores)
         plan = merged.plan
-        part = read_plan(part_path(output))
-        if read_plan(output) == plan and part != plan:  # else its repair has begun
+        if read_plan(output) == plan:
             FeatureStore.open(output)  # refuses a store that changed after sealing
             print(f"{output}: up to date, nothing to do")
             return None
@@ -208,11 +200,12 @@ def merge(inputs: Sequence[Path], output: Path | None) -> MergedEpisodes | None:
             check_trailers(store.path)
             store.array("tick/vl_row")  # checks the positions that ticks hold
         with closing(StoreBuild(output, merged.specs, plan)) as build:
-            if part == plan and build.layout_damage() is None:
-                print(f"continuing the interrupted build {build.part}")
-            else:
-                _lay_out(build, merged, inodes)
-            _fill(build, merged)
+            _copy(build, merged)
+            for store, inode in zip(stores, inodes, strict=True):
+                if store.path.stat().st_ino != inode:
+                    raise StoreMismatch(
+                        f"{store.path}: another store took its place meanwhile. Merge again."
+                    )
             build.write_golden(_golden(merged))
             build.seal()
     return merged
@@ -297,8 +290,11 @@ def _free_name(episode: Episode, store: Path, names: Mapping[tuple[str, str], Pa
     return name
 
 
-def _lay_out(build: StoreBuild, merged: MergedEpisodes, inodes: Sequence[Inode | None]) -> None:
-    """Write everything but the feature rows; link whole chunks at the start of the first input."""
+def _copy(build: StoreBuild, merged: MergedEpisodes) -> None:
+    """Write everything; link whole chunks at the start of the first input.
+
+    Raises `StoreIncomplete`, which names a feature row that does not give its checksum.
+    """
     first = merged.stores[0]
     build.create()
     for name in _COPIED:
@@ -307,45 +303,39 @@ def _lay_out(build: StoreBuild, merged: MergedEpisodes, inodes: Sequence[Inode |
     build.allocate()
     for name, values in merged.arrays.items():
         build.write(name, 0, values)
-    for name in tqdm(_COPIED, "streams", unit="array", disable=None, leave=False):
+    for name in tqdm(_COPIED, "merge", unit="array", disable=None, leave=False):
         for run in merged.runs:
             for rows, values in run.blocks(name):  # `write` skips linked chunks
                 if name in POSITIONS:
                     values += run.shift[POSITIONS[name]]
+                if name == FEATURES:
+                    store, sums = run.store, run.store.array(CHECKSUMS)[rows.start : rows.stop]
+                    spec = read_spec(store.path, name)
+                    check_row_checksums(store.path, spec, rows, values, sums)
                 build.write(name, rows.start + run.shift[name.split("/")[0]], values)
-    for store, inode in zip(merged.stores, inodes, strict=True):
-        refuse_replaced(store.path, inode)
     streams = {name: merged.having(name).streams[name] for name in ("sensor", "state")}
     tuned = join_tuned_on(tuned_on_of_store(store.attrs, store.path) for store in merged.stores)
-    its_own = {"sources": merged.sources, "streams": first.streams | streams, "environment": []}
+    its_own = {
+        "sources": merged.sources,
+        "streams": first.streams | streams,
+        "environment": _environment(merged),
+    }
     attrs = {name: value for name, value in first.attrs.items() if name not in _NOT_TAKEN}
     of_vl = group_attributes(first.path / "vl")
     build.finish_layout(attrs | its_own | tuned_on_attributes(tuned), of_vl)
 
 
-def _fill(build: StoreBuild, merged: MergedEpisodes) -> None:
-    """Copy the missing feature rows, with their keys and environments.
-
-    Raises `StoreIncomplete`, which names a row that does not give its checksum.
-    """
-    missing, total = build.missing(), build.specs[FEATURES].shape[0]
-    done = total - len(missing)
-    with tqdm(total=total, initial=done, desc="merge", unit="row", disable=None) as progress:
-        for run in merged.runs:
-            store, rows, shift = run.store, run.rows["vl"], run.shift["vl"]
-            source = read_spec(store.path, FEATURES)
-            first, last = np.searchsorted(missing, [rows.start + shift, rows.stop + shift])
-            wanted = missing[first:last] - shift
-            for environment, part in environment_runs(store.attrs["environment"], wanted):
-                number = build.environment_index(environment)
-                for block, values in run.blocks(FEATURES, part):
-                    inside = slice(block.start, block.stop)
-                    checksums = store.array(CHECKSUMS)[inside]
-                    check_row_checksums(store.path, source, block, values, checksums)
-                    keys = [key.tobytes() for key in store.array(KEYS)[inside]]
-                    target = range(block.start + shift, block.stop + shift)
-                    build.commit(target, values, keys, number)
-                    progress.update(len(block))
+def _environment(merged: MergedEpisodes) -> list[dict[str, Any]]:
+    """The software and hardware that computed each range of rows."""
+    ranges: list[dict[str, Any]] = []
+    for run in merged.runs:
+        shift, rows = run.shift["vl"], np.array(run.rows["vl"], np.int64)
+        for environment, part in environment_runs(run.store.attrs["environment"], rows):
+            begin, end = part.start + shift, part.stop + shift
+            if ranges and ranges[-1] == {"rows": ranges[-1]["rows"], **environment}:
+                begin = ranges.pop()["rows"][0]
+            ranges.append({"rows": [begin, end], **environment})
+    return ranges
 
 
 def _golden(merged: MergedEpisodes) -> list[GoldenFrames]:

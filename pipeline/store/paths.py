@@ -1,7 +1,8 @@
 """The three places of a store, and the steps that take a build from one to the next.
 
     <name>.zarr            the finished store, never modified
-    <name>.zarr.part       the build; `.known/<n>` in it are interrupted builds of other plans
+    <name>.zarr.part       the build; `.known` in it is an interrupted build of another plan, which
+                           may have a `.known` of its own
     <name>.zarr.previous   the replaced store, kept and marked, where it has other rows
 
 A process that changes one of them must hold `<name>.zarr.lock` and call `recover` first. A part
@@ -25,7 +26,6 @@ A kill leaves:
 """
 
 import os
-from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -33,10 +33,8 @@ from pipeline.base import files
 from pipeline.base.border import Border, shown
 from pipeline.base.errors import ConfigError, StoreIncomplete, StoreMismatch
 from pipeline.base.files import (
-    MARKER,
     OutputKind,
     begin_folder,
-    claim,
     described,
     mark,
     refuse_foreign,
@@ -58,10 +56,6 @@ from pipeline.store.schema import READABLE
 MERGED = "merge-"
 """Prefix of the plan of a store that was merged, not extracted."""
 
-ASIDE_METADATA = ".zarr.json"
-"""The name that `set_build_aside` gives a build's metadata until the rest has moved."""
-Inode = tuple[int, int]
-
 
 def part_path(target: Path) -> Path:
     """Where a store is built."""
@@ -80,16 +74,7 @@ def is_store(path: Path) -> bool:
 
 
 STORE = OutputKind("a feature store", is_store)
-_LINK_ENDS = "/."
-"""The end of a kept link; it marks the link, because nothing is written into its target."""
-
-
-def _is_kept_link(path: Path) -> bool:
-    # A Path would drop this end.
-    return path.is_symlink() and os.readlink(path).endswith(_LINK_ENDS)  # noqa: PTH115
-
-
-KEPT = OutputKind("a store of before, kept for its rows,", _is_kept_link)
+KEPT = OutputKind("a store of before, kept for its rows,")
 """The previous store, known by its marker; a user's copy has no marker.
 
 The name must not change: markers of earlier versions contain it.
@@ -125,8 +110,11 @@ def recover(target: Path) -> None:
     remove_folder(target / KNOWN, STORE)
     if KEPT.marks(previous := previous_path(target)) and not (previous / "zarr.json").exists():
         remove_folder(previous, KEPT)  # its removal was stopped
-    for moving in part.glob(f"{KNOWN}/*/{ASIDE_METADATA}"):
-        _move_build(part, moving.parent)
+    if there(fresh := _fresh_path(target)):
+        if there(fresh / KNOWN):
+            fresh.rename(part)
+        else:
+            remove_folder(fresh, STORE)
 
 
 def begin_build(target: Path) -> None:
@@ -135,17 +123,22 @@ def begin_build(target: Path) -> None:
 
 
 def set_build_aside(target: Path) -> None:
-    """Move the build into `.known` of its own part, where its rows stay known."""
-    part = part_path(target)
-    folder = _place_aside(part)
-    folder.mkdir()
-    (part / "zarr.json").rename(folder / ASIDE_METADATA)
-    _move_build(part, folder)
+    """Move the build into `.known` of a new part, where its rows stay known."""
+    part, fresh = part_path(target), _fresh_path(target)
+    begin_folder(fresh, STORE)
+    part.rename(fresh / KNOWN)
+    fresh.rename(part)
 
 
 def builds_aside(target: Path) -> list[Path]:
-    """The builds that were set aside."""
-    return [path for path in sorted((part_path(target) / KNOWN).glob("*")) if is_store(path)]
+    """The builds that were set aside, the last one first."""
+    builds: list[Path] = []
+    folder = part_path(target) / KNOWN
+    while folder.is_dir():
+        if is_store(folder):
+            builds.append(folder)
+        folder = folder / KNOWN
+    return builds
 
 
 def unfinished_plans(target: Path) -> list[str]:
@@ -157,36 +150,22 @@ def unfinished_plans(target: Path) -> list[str]:
 def put_in_place(target: Path, keep: bool = False) -> None:
     """Rename a sealed part to the store; remove the old store, or `keep` it as the previous one.
 
-    If the old store is a symbolic link, only the link is removed; to keep it, a link to the same
-    folder is made. Raises `ConfigError` where something foreign lies in one of the places.
+    If the old store is a symbolic link, only the link is removed. Raises `ConfigError` where
+    something foreign lies in one of the places.
     """
-    previous = previous_path(target)
-    if keep and there(target):
+    if keep and target.is_dir() and not target.is_symlink():
+        previous = previous_path(target)
         refuse_foreign(previous, KEPT)
-        if target.is_symlink():
-            remove_folder(previous, KEPT)
-            previous.symlink_to(os.path.realpath(target) + _LINK_ENDS)
-            target.unlink()
-        else:
-            mark(target, KEPT)  # before the older one is removed: a full disk may refuse this
-            remove_folder(previous, KEPT)
-            target.rename(previous)
+        mark(target, KEPT)  # before the older one is removed: a full disk may refuse this
+        remove_folder(previous, KEPT)
+        target.rename(previous)
     files.put_in_place(part_path(target), target, STORE)
     remove_folder(target / KNOWN, STORE)
 
 
-def _place_aside(part: Path) -> Path:
-    """A free place in `.known`."""
-    for folder in (part, part / KNOWN):
-        claim(folder, STORE)
-    return next(path for number in count() if not (path := part / KNOWN / str(number)).exists())
-
-
-def _move_build(part: Path, folder: Path) -> None:
-    for entry in part.iterdir():
-        if entry.name not in (MARKER, KNOWN):
-            entry.rename(folder / entry.name)
-    (folder / ASIDE_METADATA).rename(folder / "zarr.json")
+def _fresh_path(target: Path) -> Path:
+    """Where a new part is for the moment in which the older one moves into it."""
+    return target.with_name(target.name + ".part.new")
 
 
 def read_plan(store: Path) -> str | None:
@@ -245,27 +224,6 @@ def find_attributes(root: Path) -> dict[str, Any]:
             f"{shown(attributes['schema'])}. Extract it again with this version."
         )
     return attributes
-
-
-def inode_of(store: Path) -> Inode | None:
-    """Identifies the store at a path, to notice a replacement; None where there is none."""
-    try:
-        status = store.stat()
-    except FileNotFoundError:
-        return None
-    return status.st_dev, status.st_ino
-
-
-def refuse_replaced(store: Path, before: Inode | None) -> None:
-    """Raise `StoreMismatch` where the store is not the one whose inode was `before`.
-
-    A finished store is never modified, but an extraction may put another in its place.
-    """
-    if inode_of(store) != before:
-        raise StoreMismatch(
-            f"{store}: another store took its place while it was being read. Run the same command "
-            "again."
-        )
 
 
 def group_attributes(path: Path) -> dict[str, Any]:

@@ -29,20 +29,24 @@ class RowSource:
     """Known feature rows by key, and streams by episode.
 
     It reads a finished store or a laid-out build, because it reads chunk files without zarr. Raises
-    `StoreIncomplete` where a finished store's keys or episodes were changed.
+    `StoreIncomplete` where a finished store's keys or episodes were changed, unless it is `damaged`
+    as everybody knows: then nothing is taken by what was changed.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, *, damaged: bool = False) -> None:
         self.path = path
         self.specs: dict[str, ArraySpec] = read_specs(path)
         self.attributes = laid_out_attributes(path)
         """Its root attributes."""
         check_agreement(path, self.attributes, self.specs)
+        self.damaged = damaged
         self._arrays: dict[str, NDArray[Any]] = {}
 
     @cached_property
     def rows(self) -> dict[bytes, int]:
         """The row of each key."""
+        if self.damaged and self._changed(KEYS):
+            return {}
         keys = self._read(KEYS)
         return {keys[row].tobytes(): int(row) for row in np.flatnonzero(self._read(CHECKSUMS))}
 
@@ -94,8 +98,7 @@ class RowSource:
     def texts(self) -> list[EpisodeText]:
         """The texts of all episodes. Equal `digest`: equal rows. Equal `content`: equal streams."""
         index = [name for name in self.specs if name.startswith("episode/")]
-        read = [self.specs[name] for name in ("vl/frame_time", *index)]
-        if not self._finished and find_damage(self.path, read):
+        if (self.damaged or not self._finished) and self._changed("vl/frame_time", *index):
             return []  # rows can then be found only by key, frame by frame
         arrays = {name: self._read(name) for name in index}
         check_index(self.path, arrays, rows_of(self.specs))
@@ -106,10 +109,14 @@ class RowSource:
         """Whether every chunk has a trailer; in a build, feature rows have none yet."""
         return self.path.suffix in (".zarr", ".previous")
 
+    def _changed(self, *names: str) -> bool:
+        specs = [self.specs[name] for name in names]
+        return find_damage(self.path, specs, self.attributes.seal) is not None
+
     def _read(self, name: str) -> NDArray[Any]:
         """All of a small array, read once."""
         if name not in self._arrays:
-            if self._finished:
+            if self._finished and not self.damaged:
                 check_chunks(self.path, [self.specs[name]], self.attributes.seal)
             self._arrays[name] = read_rows(self.path, self.specs[name])
         return self._arrays[name]

@@ -32,7 +32,7 @@ CHUNK_BYTES = 64 * 2**20
 TRAILER_BYTES = 4
 KEY_BYTES = 16
 _MOST_CHUNK_BYTES = 2 * CHUNK_BYTES
-_MOST_ROW_BYTES = 2**26
+MOST_ROW_BYTES = 2**26
 
 FEATURES, KEYS, CHECKSUMS = "vl/features", "vl/key", "vl/checksum"
 INCREMENTAL = (FEATURES, KEYS, CHECKSUMS)
@@ -290,8 +290,8 @@ def array_of(document: dict[str, Any], name: str, where: Path | str, border: Bor
     allowed = _CHOSEN.get(name) or (np.dtype(code).name,)
     dtype = array.data_type if array.data_type in allowed else allowed[0]
     spec = ArraySpec(name, tuple(array.shape), np.dtype(dtype).newbyteorder("<"))
-    if spec.row_bytes > _MOST_ROW_BYTES:
-        what = f"expected rows of at most {_MOST_ROW_BYTES:,} bytes, found the shape {array.shape}"
+    if spec.row_bytes > MOST_ROW_BYTES:
+        what = f"expected rows of at most {MOST_ROW_BYTES:,} bytes, found the shape {array.shape}"
         raise border.refusal(where, what)
     rows = array.chunk_rows
     whole = max(1, math.ceil(spec.shape[0] / ROW_MULTIPLE)) * ROW_MULTIPLE

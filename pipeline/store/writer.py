@@ -23,11 +23,11 @@ from numpy.typing import NDArray
 
 from pipeline.base.errors import StoreIncomplete
 from pipeline.base.files import disk_full_named, sync
-from pipeline.store.border import store_border
+from pipeline.store.border import mend, store_border
 from pipeline.store.chunks import (
     ChunkFiles,
+    check_metadata,
     find_damage,
-    metadata_damage,
     note_metadata,
     read_chunk,
     read_rows,
@@ -181,8 +181,10 @@ class StoreBuild:
 
         None where they are unchanged. Reads all of them.
         """
-        if what := metadata_damage(self.part):
-            return f"{self.part / 'zarr.json'}: {what}"
+        try:
+            check_metadata(self.part)
+        except StoreIncomplete as error:
+            return str(error).removesuffix(f". {mend(self.part)}")
         laid_out = (spec for name, spec in self.specs.items() if name not in INCREMENTAL)
         return find_damage(self.part, laid_out)
 
@@ -292,8 +294,7 @@ class StoreBuild:
     def files(self, name: str) -> ChunkFiles:
         """The chunk files of one array."""
         if name not in self._files:
-            owned = name in INCREMENTAL
-            self._files[name] = ChunkFiles(self.part, self.specs[name], owned=owned)
+            self._files[name] = ChunkFiles(self.part, self.specs[name])
         return self._files[name]
 
 

@@ -10,7 +10,6 @@ from PIL import Image
 from pipeline.base.config import Params
 from pipeline.data.episode import RowRange
 from pipeline.extract import extract
-from pipeline.extract.repair import repair
 from pipeline.store import FeatureStore, StoreBuild
 from pipeline.store.chunks import write_seal
 from pipeline.store.golden import GOLDEN
@@ -31,7 +30,7 @@ def assert_golden(params: Params) -> FeatureStore:
     rows = [entry["row"] for entry in store.attrs[GOLDEN]]
     full = np.flatnonzero(np.isfinite(store.array("vl/frame_time")).all(axis=1))
     assert (rows[0], rows[-1]) == (full[0], full[-1])
-    checked = verify(store.path, threads=1)
+    checked = verify(store.path)
     assert checked.sound, checked.lines()
     return store
 
@@ -99,7 +98,7 @@ class TestBuilds:
         store = FeatureStore.open(params.extract.store)
         assert store.golden == ()
         assert store.attrs[GOLDEN] == []
-        assert verify(store.path, threads=1).sound
+        assert verify(store.path).sound
 
 
 class TestStoreBefore:
@@ -113,21 +112,6 @@ class TestStoreBefore:
         extract(changed(extract={"sensor_dtype": "float16"}), quiet)
         assert_golden(params)
         assert contents(params.extract.store / GOLDEN) == before
-
-    def test_they_are_carried_by_a_repair_but_for_those_that_are_damaged(
-        self, params, extracted, monkeypatch
-    ):
-        store = params.extract.store
-        before = FeatureStore.open(store).golden
-        (store / "golden/2/View1/c/0/0/0").write_bytes(b"rot")
-        repair(verify(store, threads=1), params, quiet)
-        decode_otherwise(monkeypatch)
-        monkeypatch.setattr(FrozenVLM, "load", without_model)
-        said: list[str] = []
-        extract(params, said.append)
-        assert any(line.startswith("1 golden row(s) left out: decoded today") for line in said)
-        after = FeatureStore.open(store).golden
-        assert [golden.key for golden in after] == [before[at].key for at in (0, 1, 3)]
 
     def test_the_bytes_are_those_of_a_fresh_build(self, params, changed, extracted, tmp_path):
         other = changed(extract={"store": str(tmp_path / "o.zarr"), "sensor_dtype": "float16"})
@@ -166,11 +150,9 @@ def test_a_repair_writes_them_anew(params, extracted, monkeypatch):
     store = params.extract.store
     before = FeatureStore.open(store).golden
     (store / "golden/2/View1/c/0/0/0").write_bytes(b"rot")
-    checked = verify(store, threads=1)
-    assert [issue.kind for issue in checked.issues] == ["golden row"]
-    repair(checked, params, quiet)
+    assert not verify(store).sound
     monkeypatch.setattr(FrozenVLM, "load", without_model)
-    extract(params, quiet)
+    extract(params, quiet, repair=True)
     after = assert_golden(params).golden
     assert [golden.key for golden in after] == [golden.key for golden in before]
 

@@ -50,7 +50,7 @@ def test_rows_are_those_of_float32_within_a_code(stores, dtype):
     numbers, exact = widen(held), whole.array("vl/features")
     largest = np.abs(exact).max(axis=-1, keepdims=True)
     assert (np.abs(numbers - exact) <= largest / (100 if dtype == "int8" else 15)).all()
-    assert verify(store.path, 1).sound
+    assert verify(store.path).sound
     some = params.model_copy(update={"verify": params.verify.model_copy(update={"reextract": 4})})
     again = reextract(store.path, some, lambda line: None)
     assert not again.beyond and len(again.deviations) == 4
@@ -125,7 +125,7 @@ def test_a_model_with_huge_channels_keeps_the_others(stores, tmp_path):
             }
         )
         run(changed)
-        assert verify(tmp_path / f"{dtype}.zarr", 1).sound
+        assert verify(tmp_path / f"{dtype}.zarr").sound
         store = FeatureStore.open(tmp_path / f"{dtype}.zarr")
         found[dtype] = widen(store.array("vl/features")).astype(np.float64)
     exact = found["float32"]

@@ -57,7 +57,6 @@ def params(root: Path, subject: str, case: Path) -> dict[str, Any]:
         },
         "extract": {"store": str(case / STORE), "batch_size": 4, "device": "cpu"},
         "archive": {"output": str(case / ARCHIVE), "threads": 1},
-        "verify": {"threads": 1},
         "train_head": {
             "sensor_encoder": {"channels": [4], "layers": 0, "heads": 1, "output_dim": 4},
             "state_encoder": {"dim": 4, "layers": 0, "heads": 1, "output_dim": 4},

@@ -112,7 +112,7 @@ def _arrays(store: Path) -> dict[str, Any]:
 def _opened(store: Path) -> Any:
     """A store, opened by zarr alone; raises where its own readers refuse it."""
     FeatureStore.open(store)
-    if not (checked := verify(store, 1)).sound:
+    if not (checked := verify(store)).sound:
         raise StoreIncomplete("; ".join(checked.lines()))
     return zarr.open_group(store, mode="r")
 

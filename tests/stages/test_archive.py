@@ -32,8 +32,6 @@ def test_archive_and_restore_beside_the_store(call, tmp_path, capsys):
     assert call() == 0
     lines = capsys.readouterr().out.splitlines()
     output = tmp_path / "tiny.archive.zarr"
-    assert lines[0].split() == ["array", "MB", "ratio", "codec"]
-    assert {"vl/features", "episode/source"} <= {line.split()[0] for line in lines[1:-1]}
     assert lines[-1].startswith(f"{output}: ") and ": 1)" in lines[-1]
     assert call() == 0
     (line,) = capsys.readouterr().out.splitlines()

@@ -143,7 +143,7 @@ def test_a_store_of_recorded_rows_says_their_rate(capsys, params_file, tmp_path)
     write_seal(store)
     assert run("", main, options) == 0, capsys.readouterr().err
     told = capsys.readouterr().out
-    assert "why: the store does not say the rate of its ticks" in told
+    assert "why: extract.sensor_dtype, action_hz, the order of episodes" in told
     assert ", 0 to compute" in told
     assert FeatureStore.open(store).action_hz == 10
 

@@ -12,13 +12,12 @@ from typing import Any
 import google_crc32c
 import numpy as np
 import pytest
-import zarr
 
 from pipeline.base.errors import PipelineError, StoreIncomplete
 from pipeline.store import FeatureStore, RowSource, part_path
 from pipeline.store.archive import archive, restore
 from pipeline.store.border import mend, restore_command, start_over
-from pipeline.store.chunks import note_metadata, write_seal
+from pipeline.store.chunks import note_metadata
 from pipeline.store.paths import read_plan
 from pipeline.store.verification import verify
 from tests.store.samples import edit, put
@@ -176,33 +175,21 @@ class TestStores:
         assert re.search(r"Run python -m stages|run python -m stages|Extract it again", message)
         assert len(message) < 2000
         try:
-            checked = verify(store, threads=1)
+            checked = verify(store)
         except PipelineError as error:
             assert str(store) in str(error)
         else:
-            assert any(str(store) in line for line in checked.lines())
+            assert all(str(store) in issue for issue in checked.issues)
+            assert not checked.sound
 
     def test_all_tell_the_same_lie(self, store):
         for path in store.glob("tick/*/zarr.json"):
             edit(path, lambda document: document["shape"].__setitem__(0, 10**12))
         note_metadata(store)
-        for work in (FeatureStore.open, RowSource, lambda at: verify(at, threads=1)):
+        for work in (FeatureStore.open, RowSource, verify):
             with pytest.raises(StoreIncomplete, match=r"expected [\d,]+ chunk files by the shape"):
                 if (checked := work(store)) and hasattr(checked, "lines"):
                     raise StoreIncomplete("\n".join(checked.lines()))
-
-    def test_a_document_that_is_a_link_to_itself(self, store):
-        document = store / "golden/1/zarr.json"
-        document.unlink()
-        document.symlink_to(document)
-        lines = verify(store, threads=1).lines()
-        assert any(f"{document}: cannot be read" in line for line in lines), lines
-
-    def test_a_group_is_opened_as_zarr_opens_it_below_another(self, store):
-        (store / "golden/zarr.json").write_text('{"zarr_format": 3, "attributes": {}}')
-        write_seal(store)
-        lines = verify(store, threads=1).lines()
-        assert any("golden/zarr.json: zarr cannot open it" in line for line in lines), lines
 
     @pytest.mark.parametrize(
         "harm", [text("tick/time", DEEP), values("episode/vl_start", 3, 2**62)]
@@ -229,16 +216,10 @@ class TestStores:
 
 
 def manifest(change: Callable[[dict[str, Any]], object]) -> Harm:
-    """Another manifest, with its digest."""
-
-    def forge(document: dict[str, Any]) -> None:
-        from pipeline.store.archive import _digest_of
-
-        entries = document["attributes"]["archive"]
-        change(entries)
-        entries["digest"] = _digest_of({key: entries[key] for key in entries if key != "digest"})
-
-    return lambda root: edit(root / "zarr.json", forge)
+    """Another manifest."""
+    return lambda root: edit(
+        root / "zarr.json", lambda document: change(document["attributes"]["archive"])
+    )
 
 
 def of_store(name: str, dotted: str, value: str) -> Harm:
@@ -251,9 +232,8 @@ def of_store(name: str, dotted: str, value: str) -> Harm:
 
 
 ARCHIVES: dict[str, Harm] = {
-    "text outside": manifest(lambda it: it["metadata"].update({"golden/0/../zarr.json": "x"})),
-    "frame outside": manifest(lambda it: it["golden"].update({"/tmp/x": "x"})),
-    "array gone": manifest(lambda it: it["arrays"].pop("tick/time")),
+    "frame outside": of_store("zarr.json", "attributes.golden.0.views", '["../../x"]'),
+    "array gone": manifest(lambda it: it["metadata"].pop("tick/time/zarr.json")),
     "no text": manifest(lambda it: it["metadata"].pop("zarr.json")),
     "text": manifest(lambda it: it["metadata"].update({"tick/time/zarr.json": DEEP})),
     "rows": of_store("tick/time/zarr.json", "shape", "[1000000000000]"),
@@ -279,13 +259,6 @@ class TestArchives:
         assert str(archived) in str(caught.value)
         assert "take another copy" in str(caught.value) or "Remove or rename" in str(caught.value)
         assert set(tmp_path.iterdir()) - {*before} <= {tmp_path / "back.zarr.lock"}
-
-    def test_other_rows_under_a_forged_manifest(self, archived, tmp_path):
-        zarr.open_array(archived, path="tick/action", mode="r+")[0] = 9.0
-        size = (archived / "tick/action/c/0/0").stat().st_size
-        manifest(lambda it: it["arrays"]["tick/action"].update(shard_bytes=[size]))(archived)
-        with pytest.raises(StoreIncomplete, match="tick/action are other ones"):
-            restore(archived, tmp_path / "back.zarr", threads=1)
 
     def test_a_piece_that_unpacks_to_more_than_it_is(self, archived, tmp_path):
         shard = archived / "tick/time/c/0"
@@ -315,8 +288,6 @@ class TestRemedies:
         assert "python -m stages.store gc some/a.zarr.part --remove" in advice
         assert advice.endswith("python -m stages.extract --set extract.store=some/a.zarr.")
         assert "--repair" not in advice
-        advice = mend(Path("some/a.zarr.part/.known/3/vl/key/c/0/0"))
-        assert advice.startswith("Remove some/a.zarr.part/.known/3, then run python -m stages.ext")
 
     def test_where_the_root_is_lost_all_say_the_same(self, tmp_path):
         for name in ("a.zarr", "a.zarr.part"):

@@ -2,11 +2,7 @@
 
 import os
 import shutil
-import time
-from collections.abc import Callable, Iterator
-from dataclasses import replace
-from multiprocessing.connection import Connection
-from multiprocessing.context import ForkServerContext
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -18,12 +14,11 @@ from pipeline.store.archive import archive
 from pipeline.store.chunks import note_metadata
 from pipeline.store.inventory import (
     StoreEntry,
-    describe_kept,
     describe_stores,
-    fate_of,
-    find_named,
+    is_unneeded,
+    leftover,
     list_stores,
-    remove_entry,
+    remove_leftover,
 )
 from pipeline.store.paths import (
     KEPT,
@@ -35,29 +30,8 @@ from pipeline.store.paths import (
     set_build_aside,
 )
 from pipeline.store.schema import read_specs
-from pipeline.store.verification import strange_files
 
 Make = Callable[..., Path]
-
-
-def hold_lock(target: Path, told: Connection) -> None:
-    """Hold the lock of a store, and tell so."""
-    with build_lock(target):
-        told.send("held")
-        time.sleep(600)
-
-
-@pytest.fixture
-def held(fork_server: ForkServerContext, tmp_path: Path) -> Iterator[int]:
-    """Another process, of this number, holds the lock of the tiny store."""
-    heard, told = fork_server.Pipe(duplex=False)
-    process = fork_server.Process(target=hold_lock, args=(tmp_path / "tiny.zarr", told))
-    process.start()
-    assert heard.recv() == "held"
-    assert process.pid is not None
-    yield process.pid
-    process.kill()
-    process.join()
 
 
 def entry(folder: Path, name: str) -> StoreEntry:
@@ -68,8 +42,8 @@ def table(folder: Path) -> str:
     return "\n".join(describe_stores(folder, list_stores(folder), {}))
 
 
-def unneeded(folder: Path) -> list[StoreEntry]:
-    return [entry for entry in list_stores(folder) if fate_of(entry)[0] == "unneeded"]
+def unneeded(folder: Path) -> list[Path]:
+    return [entry.path for entry in list_stores(folder) if is_unneeded(entry)]
 
 
 def unfinish(store: Path, done: int) -> Path:
@@ -108,12 +82,15 @@ class TestListing:
         build = entry(tmp_path, "tiny.zarr.part")
         assert (build.kind, build.done) == ("build", 25)
         assert "25 of 60" in table(tmp_path)
+        for _ in range(2):  # to look does not stand in a builder's way
+            with build_lock(tmp_path / "tiny.zarr"):
+                assert "being built" in table(tmp_path)
+            assert "being built" not in table(tmp_path)
 
     @pytest.mark.parametrize(
         ("harm", "message"),
         [
             (lambda store: (store / "zarr.json").write_text("{"), "cannot be read as JSON"),
-            (lambda store: (store / "zarr.json").unlink(), "no finished store"),
             (lambda store: shutil.rmtree(store / "tick/action"), "action/zarr.json: no such file"),
             (lambda store: os.truncate(store / "vl/features/c/0/0/0", 99), "found 99"),
         ],
@@ -126,21 +103,10 @@ class TestListing:
         assert message in (entry(tmp_path, "damaged.zarr").damage or "")
         assert entry(tmp_path, "sound.zarr").damage is None
         assert "\ndamaged.zarr  damaged" in table(tmp_path)
-        assert message in table(tmp_path)
 
     def test_an_archive(self, tiny_store: Make, tmp_path: Path) -> None:
         archive(tiny_store(tmp_path), tmp_path / "tiny.archive.zarr", level=1, threads=1)
-        assert entry(tmp_path, "tiny.archive.zarr").kind == "archive"
         assert "\ntiny.archive.zarr  archive" in table(tmp_path)
-
-    def test_asking_who_builds_does_not_stand_in_a_builders_way(
-        self, tiny_store: Make, tmp_path: Path
-    ) -> None:
-        part = unfinish(tiny_store(tmp_path), 0)
-        for _ in range(2):
-            with build_lock(tmp_path / "tiny.zarr"):
-                assert f"being built by process {os.getpid()} on" in table(tmp_path)
-            assert entry(tmp_path, part.name).holder is None
 
     def test_subfolders_are_searched_but_not_stores(self, tiny_store: Make, tmp_path: Path) -> None:
         inner = tiny_store(tmp_path / "deep" / "er")
@@ -152,90 +118,39 @@ class TestListing:
 
 
 class TestLeftovers:
-    def test_a_finished_store_and_its_archive_are_never_among_them(
-        self, tiny_store: Make, tmp_path: Path
-    ) -> None:
-        path = tiny_store(tmp_path)
-        archive(path, tmp_path / "tiny.archive.zarr", level=1, threads=1)
-        os.truncate(tiny_store(tmp_path, name="bad") / "vl/features/c/0/0/0", 99)
-        assert {entry.path.suffix for entry in unneeded(tmp_path)} <= {".lock"}
-
-    def test_each_is_named_with_its_reason_and_removed(
-        self, tiny_store: Make, tmp_path: Path
-    ) -> None:
-        tiny_store(tmp_path)
-        unfinish(tiny_store(tmp_path, name="none"), 0)
-        (tmp_path / "new.zarr.part").mkdir()
-        for name in ("gone.zarr.files.sqlite", "tiny.zarr.files.sqlite", "tiny.zarr.lock"):
-            (tmp_path / name).touch()
-        entries = unneeded(tmp_path)
-        stopped = "a build that was stopped before any row was done"
-        assert {entry.path.name: fate_of(entry)[1] for entry in entries} == {
-            "gone.zarr.files.sqlite": "content digests for a store that is not there",
-            "new.zarr.part": stopped,
-            "none.zarr.part": stopped,
-            "tiny.zarr.lock": "held by no process",
-        }
-        for leftover in entries:
-            remove_entry(leftover, fate_of(leftover)[0])
-        assert sorted(os.listdir(tmp_path)) == ["tiny.zarr", "tiny.zarr.files.sqlite"]
-        assert FeatureStore.open(tmp_path / "tiny.zarr").ticks == 180
-
-    def test_work_is_kept_unless_it_is_named(self, tiny_store: Make, tmp_path: Path) -> None:
-        begun = unfinish(tiny_store(tmp_path, name="begun"), 12)
+    def test_only_builds_without_rows_are_unneeded(self, tiny_store: Make, tmp_path: Path) -> None:
         store = tiny_store(tmp_path)
-        part = hold(store)
-        shutil.copytree(begun, part / ".known" / "0")
-        previous = Path(shutil.copytree(store, previous_path(store)))
-        mark(previous, KEPT)
+        archive(store, tmp_path / "tiny.archive.zarr", level=1, threads=1)
+        os.truncate(tiny_store(tmp_path, name="bad") / "vl/features/c/0/0/0", 99)
+        none = unfinish(tiny_store(tmp_path, name="none"), 0)
+        begun = unfinish(tiny_store(tmp_path, name="begun"), 12)
+        shutil.copytree(begun, hold(store) / ".known")
+        mark(Path(shutil.copytree(store, previous_path(store))), KEPT)
         unread = Path(shutil.copytree(begun, tmp_path / "unread.zarr.part"))
         (unread / "vl" / "checksum" / "zarr.json").write_text("{")
-        entries = list_stores(tmp_path)
-        assert unneeded(tmp_path) == []
-        lines = describe_kept(entries)
-        assert lines[0] == (
-            f"{begun}: unfinished build with 12 feature rows; the same command goes on, and "
-            f"python -m stages.store gc {begun} --remove removes it"
-        )
-        assert lines[1].startswith(f"{part}: unfinished build with 72 feature rows")
-        assert lines[2].startswith(f"{previous}: the store before, kept until")
-        assert lines[3].startswith(f"{unread}: unfinished build that cannot be read")
-        assert len(lines) == 4
-        for path in (store, tmp_path / "gone.zarr.part"):
+        (tmp_path / "new.zarr.part").mkdir()
+        assert unneeded(tmp_path) == [tmp_path / "new.zarr.part", none]
+        with build_lock(tmp_path / "none.zarr"):
+            assert unneeded(tmp_path) == [tmp_path / "new.zarr.part"]
+            with pytest.raises(StoreLocked, match="being built by process"):
+                remove_leftover(leftover(none))
+        for path in (store, tmp_path / "gone.zarr.part", tmp_path / "tiny.archive.zarr"):
             with pytest.raises(ConfigError, match=rf"{path}: .*Nothing was removed"):
-                find_named(entries, [begun, path])
-        for leftover in find_named(entries, [begun, part, previous, unread]):
-            remove_entry(leftover, fate_of(leftover)[0])
-        assert os.listdir(tmp_path) == ["tiny.zarr"]
+                leftover(path)
+        for path in (begun, part_path(store), previous_path(store), unread, none):
+            remove_leftover(leftover(path))
+        left = {path.name for path in tmp_path.iterdir() if path.suffix != ".lock"}
+        assert left == {"tiny.zarr", "tiny.archive.zarr", "bad.zarr", "new.zarr.part"}
+        assert FeatureStore.open(store).ticks == 180
 
-    def test_the_only_copy_of_a_store_is_never_removed(
-        self, tiny_store: Make, tmp_path: Path
-    ) -> None:
+    def test_the_only_copy_of_a_store_is_put_back(self, tiny_store: Make, tmp_path: Path) -> None:
         """A kill between the two renames of a replacement leaves it in `.replaced` of the part."""
         store = tiny_store(tmp_path)
         part = hold(store)
-        (listed,) = find_named(list_stores(tmp_path), [part])
-        fate, _ = fate_of(listed)
         shutil.rmtree(store)
-        assert unneeded(tmp_path) == []
-        assert "the only copy of tiny.zarr" in describe_kept(list_stores(tmp_path))[0]
-        with pytest.raises(ConfigError, match="the only copy"):
-            find_named(list_stores(tmp_path), [part])
-        remove_entry(listed, fate)  # listed while the store was still there
-        assert part.exists()
-
-    def test_what_is_being_built_is_not_touched(
-        self, tiny_store: Make, tmp_path: Path, held: int
-    ) -> None:
-        part = unfinish(tiny_store(tmp_path), 5)
-        entries = list_stores(tmp_path)
-        with pytest.raises(ConfigError, match="in use by process"):
-            find_named(entries, [part])
-        assert describe_kept(entries)[0].startswith(f"{part}: in use by process {held}")
-        listed = replace(entry(tmp_path, part.name), holder=None)  # listed before that build began
-        with pytest.raises(StoreLocked, match="not removed"):
-            remove_entry(listed, fate_of(listed)[0])
-        assert part.exists()
+        remove_leftover(leftover(part))
+        assert not part.exists()
+        assert FeatureStore.open(store).ticks == 180
 
     @pytest.mark.parametrize("state", ["begun", "damaged", "sealed", "kept"])
     def test_a_removal_that_was_killed_leaves_what_the_next_build_takes(
@@ -252,7 +167,6 @@ class TestLeftovers:
             place = unfinish(store, 0)
         if state == "damaged":
             (place / "zarr.json").write_text("{")
-        (leftover,) = find_named(list_stores(tmp_path), [place])
 
         def killed(path: Path) -> None:
             (place / "zarr.json").unlink(missing_ok=True)
@@ -260,17 +174,18 @@ class TestLeftovers:
 
         monkeypatch.setattr("pipeline.base.files.shutil.rmtree", killed)
         with pytest.raises(KeyboardInterrupt):
-            remove_entry(leftover, fate_of(leftover)[0])
+            remove_leftover(leftover(place))
         assert any(place.iterdir())
         assert kind.owns(place)
 
-    @pytest.mark.parametrize("suffix", ["files.sqlite", "lock", "part", "previous"])
-    def test_a_foreign_file_is_no_leftover(self, tmp_path: Path, suffix: str) -> None:
+    @pytest.mark.parametrize("suffix", ["part", "previous"])
+    def test_what_is_foreign_is_no_leftover(self, tmp_path: Path, suffix: str) -> None:
         foreign = tmp_path / f"gone.zarr.{suffix}"
-        foreign.write_text("years of work")
-        assert unneeded(tmp_path) == []
-        with pytest.raises(ConfigError, match="did not write"):
-            find_named(list_stores(tmp_path), [foreign])
+        foreign.mkdir()
+        (foreign / "thesis").write_text("years of work")
+        assert list_stores(tmp_path) == []
+        with pytest.raises(ConfigError, match="Nothing was removed"):
+            leftover(foreign)
 
     def test_nothing_behind_a_symbolic_link_is_touched(
         self, tiny_store: Make, tmp_path: Path
@@ -281,37 +196,21 @@ class TestLeftovers:
         (folder / "tiny.zarr.part").symlink_to(outside)
         (folder / "more").symlink_to(outside.parent)
         assert unneeded(folder) == []
-        assert "a symbolic link" in describe_kept(list_stores(folder))[0]
         with pytest.raises(ConfigError, match=r"found a link to .*tiny\.zarr\.part\. Move it back"):
-            recover(folder / "tiny.zarr")
+            remove_leftover(leftover(folder / "tiny.zarr.part"))
         part = folder / "own.zarr.part"
         begin_folder(part, STORE)
         (part / "inside").symlink_to(outside)
-        for leftover in unneeded(folder):
-            remove_entry(leftover, fate_of(leftover)[0])
+        remove_leftover(leftover(part))
         assert not part.exists()
         assert (outside / "zarr.json").exists()
 
 
-def test_rows_of_a_build_that_was_being_set_aside_are_removed_by_name_only(
-    tiny_store: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """A kill just after its metadata moved: no store is to be seen there."""
+def test_rows_of_a_build_that_was_set_aside_count(tiny_store: Make, tmp_path: Path) -> None:
     part = unfinish(tiny_store(tmp_path), 12)
-
-    def killed(*_: Path) -> None:
-        raise KeyboardInterrupt
-
-    with monkeypatch.context() as patch:
-        patch.setattr("pipeline.store.paths._move_build", killed)
-        with pytest.raises(KeyboardInterrupt):
-            set_build_aside(tmp_path / "tiny.zarr")
-    build = entry(tmp_path, part.name)
-    assert fate_of(build)[0] == "by name"
-    assert not remove_entry(build, "unneeded"), "its fate is another than when it was listed"
-    recover(tmp_path / "tiny.zarr")
-    (line,) = describe_kept(list_stores(tmp_path))
-    assert line.startswith(f"{part}: unfinished build with 12 feature rows")
+    set_build_aside(tmp_path / "tiny.zarr")
+    assert entry(tmp_path, part.name).done == 12
+    assert unneeded(tmp_path) == []
 
 
 def test_what_kills_left_of_replacements_goes(tiny_store: Make, tmp_path: Path) -> None:
@@ -324,10 +223,3 @@ def test_what_kills_left_of_replacements_goes(tiny_store: Make, tmp_path: Path) 
     recover(target)
     assert not (part / REPLACED).exists()
     assert not previous_path(target).exists()
-    # A third one while the old store was removed from inside the new one.
-    shutil.copytree(target, target / REPLACED)
-    assert not list(strange_files(target, read_specs(target), set(target.glob("golden/**/*"))))
-    (target / ".known").mkdir()
-    (target / ".known" / "mine").touch()
-    (strange,) = strange_files(target, read_specs(target), set(target.glob("golden/**/*")))
-    assert strange.file == target / ".known" / "mine", "no marker says that it is the project's"

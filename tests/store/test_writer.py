@@ -1,12 +1,9 @@
 """A build loses at most what was in flight, whatever kills it."""
 
 import errno
-import fcntl
 import os
 import shutil
-import socket
 import subprocess
-import time
 from collections.abc import Callable
 from itertools import product
 from pathlib import Path
@@ -30,7 +27,6 @@ from pipeline.store import (
     recover,
 )
 from pipeline.store.chunks import check_trailers, row_checksums
-from pipeline.store.lock import lock_holder
 from pipeline.store.paths import (
     KEPT,
     begin_build,
@@ -222,8 +218,7 @@ class TestSeal:
 
         assert kill_everywhere(begun, check, stride) >= 4
 
-    @pytest.mark.parametrize("linked", [False, True])
-    def test_a_kill_while_the_old_is_kept_is_mended_by_sealing_again(self, full, tmp_path, linked):
+    def test_a_kill_while_the_old_is_kept_is_mended_by_sealing_again(self, full, tmp_path):
         """Kill before the n-th change of the folders, for every n, until none is left."""
         built = tmp_path / "built"
         full(built, "before", seed=1).seal()
@@ -231,9 +226,6 @@ class TestSeal:
 
         def check(folder: Path, kill_at: int) -> bool:
             target, previous = folder / "s.zarr", folder / "s.zarr.previous"
-            if linked:
-                target.rename(folder / "big")
-                target.symlink_to("big")
             killed = killed_before(kill_at, lambda: put_in_place(target, keep=True))
             recover(target)
             assert not KEPT.marks(target)
@@ -242,8 +234,7 @@ class TestSeal:
             for store, seed in ((target, 0), (previous, 1)):
                 assert np.array_equal(FeatureStore.open(store).array(FEATURES), rows_of(seed, ROWS))
             assert KEPT.owns(previous)
-            assert previous.is_symlink() == linked
-            assert {*os.listdir(folder)} == {"s.zarr", "s.zarr.previous", *["big"] * linked}
+            assert {*os.listdir(folder)} == {"s.zarr", "s.zarr.previous"}
             assert sorted(os.listdir(target)) == sorted(os.listdir(built / "s.zarr"))
             return killed
 
@@ -274,7 +265,7 @@ class TestSeal:
             target = folder / "s.zarr"
             killed = killed_before(kill_at, lambda: set_build_aside(target))
             recover(target)
-            (known,) = filter(is_store, [part_path(target), *builds_aside(target)])
+            (known,) = [*filter(is_store, [part_path(target)]), *builds_aside(target)]
             row, environment = RowSource(known).take(bytes(16)) or (None, {})
             assert np.array_equal(row, rows_of(0, 1)[0])
             assert environment == {"torch": "1"}
@@ -282,7 +273,7 @@ class TestSeal:
             assert killed or [known] == builds_aside(target)
             return killed
 
-        assert kill_everywhere(tmp_path / "begun", check) > 6
+        assert kill_everywhere(tmp_path / "begun", check) >= 2
 
     def test_a_finished_store_replaced_is_never_written(self, full, tmp_path):
         full(tmp_path, "before", seed=1).seal()
@@ -292,10 +283,11 @@ class TestSeal:
         full(tmp_path, "after").seal()
         assert content(kept) == before
 
-    def test_a_store_behind_a_symbolic_link_loses_the_link_alone(self, full, tmp_path):
+    @pytest.mark.parametrize("keep", [False, True])
+    def test_a_store_behind_a_symbolic_link_loses_the_link_alone(self, full, tmp_path, keep):
         full(tmp_path / "disk", "before", seed=1).seal()
         (tmp_path / "s.zarr").symlink_to(tmp_path / "disk" / "s.zarr")
-        full(tmp_path, "after").seal()
+        full(tmp_path, "after").seal(keep=keep)
         assert sorted(path.name for path in tmp_path.iterdir()) == ["disk", "s.zarr"]
         assert not (tmp_path / "s.zarr").is_symlink()
         behind = FeatureStore.open(tmp_path / "disk" / "s.zarr")
@@ -316,21 +308,6 @@ class TestSeal:
 
 
 class TestLinks:
-    def test_a_build_that_was_copied_by_links_goes_on_and_leaves_the_copy_alone(self, tmp_path):
-        build = begun(tmp_path)
-        build.commit(range(5), rows_of(0, 5), [bytes(16)] * 5, 0)
-        build.close()
-        kept = tmp_path / "kept"
-        subprocess.run(["cp", "-al", build.part, kept], check=True)
-        before = content(kept / "vl")
-        again = resumed(build)
-        again.commit(range(5, ROWS), rows_of(1, 7), [bytes(16)] * 7, 0)
-        again.seal()
-        wanted = np.concatenate([rows_of(0, 5), rows_of(1, 7)])
-        assert np.array_equal(FeatureStore.open(again.target).array(FEATURES), wanted)
-        assert np.array_equal(zarr.open_array(again.target, path=FEATURES, mode="r")[:], wanted)
-        assert content(kept / "vl") == before
-
     @pytest.mark.parametrize("harm", [None, lambda path: os.truncate(path, 99), Path.unlink])
     def test_whole_unchanged_chunks_are_linked_and_others_are_written(
         self, tmp_path, monkeypatch, harm
@@ -381,53 +358,10 @@ class TestLock:
         with build_lock(target):
             pass
 
-    def test_a_file_tidied_away_before_it_was_locked_excludes_nobody(self, tmp_path, monkeypatch):
-        real = fcntl.flock
-
-        def late(file, how) -> None:
-            (tmp_path / "s.zarr.lock").unlink()
-            real(file, how)
-
-        monkeypatch.setattr("fcntl.flock", late)
-        refused = pytest.raises(StoreLocked, match="removed by another process")
-        with refused, build_lock(tmp_path / "s.zarr"):
-            pass
-
-    def left_by(self, folder: Path, holder: str, age_s: float) -> Path:
-        """A lock file that a process left behind, `age_s` after its last sign of life."""
-        path = folder / "s.zarr.lock"
-        path.write_text(f"{holder}\n")
-        then = time.time() - age_s
-        os.utime(path, (then, then))
-        return folder / "s.zarr"
-
-    def test_a_dead_process_of_this_host_left_nothing(self, tmp_path):
-        target = self.left_by(tmp_path, f"process 1 on {socket.gethostname()}", 0)
-        with build_lock(target):
+    def test_a_dead_process_left_nothing(self, tmp_path):
+        (tmp_path / "s.zarr.lock").write_text("process 1 on elsewhere\n")
+        with build_lock(tmp_path / "s.zarr"):
             assert f"process {os.getpid()}" in (tmp_path / "s.zarr.lock").read_text()
-
-    def test_another_host_is_believed_while_it_gives_signs_of_life(self, tmp_path):
-        """A shared file system may keep flock to each host: the file itself is asked too."""
-        target = self.left_by(tmp_path, "process 7 on elsewhere", 30)
-        refusal = r"process 7 on elsewhere.*sign of life 30 s ago"
-        for _ in range(2):  # being refused is no sign of life
-            with pytest.raises(StoreLocked, match=refusal), build_lock(target):
-                pass
-        with build_lock(self.left_by(tmp_path, "process 7 on elsewhere", 61)):
-            pass
-
-    def test_a_time_ahead_of_the_clock_is_no_sign_of_life(self, tmp_path):
-        """Such as that of a host whose clock is wrong: it counts from when it was seen."""
-        target = self.left_by(tmp_path, "process 7 on elsewhere", -86_400)
-        path = tmp_path / "s.zarr.lock"
-        assert lock_holder(path) is None
-        with pytest.raises(StoreLocked, match="sign of life 0 s ago"), build_lock(target):
-            pass
-        assert abs(path.stat().st_mtime - time.time()) < 10
-        assert lock_holder(path) == "process 7 on elsewhere"
-        os.utime(path, (path.stat().st_mtime - 61,) * 2)
-        with build_lock(target):
-            pass
 
     @pytest.mark.parametrize(
         ("make", "message"),
@@ -443,38 +377,19 @@ class TestLock:
         path = tmp_path / "s.zarr.lock"
         make(path)
         before = path.lstat()
-        for look in (build_lock(tmp_path / "s.zarr").__enter__, lambda: lock_holder(path)):
-            with pytest.raises(ConfigError, match=f"s.zarr.lock: .*{message}.*move it away"):
-                look()
+        refused = pytest.raises(ConfigError, match=f"s.zarr.lock: .*{message}.*move it away")
+        with refused, build_lock(tmp_path / "s.zarr"):
+            pass
         assert not (tmp_path / "nowhere").exists()
         assert (path.lstat().st_size, path.lstat().st_mtime) == (before.st_size, before.st_mtime)
 
-    def test_a_holder_gives_signs_of_life(self, tmp_path, monkeypatch):
-        monkeypatch.setattr("pipeline.store.lock._BEAT_S", 0.01)
-        path = tmp_path / "s.zarr.lock"
-        with build_lock(tmp_path / "s.zarr"):
-            os.utime(path, (1, 1))
-            deadline = time.monotonic() + 10
-            while path.stat().st_mtime == 1 and time.monotonic() < deadline:
-                time.sleep(0.01)
-            assert path.stat().st_mtime > 1
-        assert path.read_text() == ""
-
-    def test_without_flock_the_file_alone_says_who_builds(self, tmp_path, monkeypatch, capsys):
+    def test_without_flock_a_build_goes_on_with_a_note(self, tmp_path, monkeypatch, capsys):
         def unsupported(*_: object) -> None:
             raise OSError(errno.EOPNOTSUPP, "Operation not supported")
 
         monkeypatch.setattr("fcntl.flock", unsupported)
-        target = tmp_path / "s.zarr"
-        with (
-            build_lock(target),
-            pytest.raises(StoreLocked, match=f"process {os.getpid()}"),
-            build_lock(target),
-        ):
-            pass
-        assert "has no locks" in capsys.readouterr().err
-        with build_lock(target):
-            pass
+        with build_lock(tmp_path / "s.zarr"):
+            assert "has no locks" in capsys.readouterr().err
 
 
 class TestChunkRule:

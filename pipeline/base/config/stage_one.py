@@ -285,14 +285,10 @@ class VerifyParams(Section):
     seed: Seed = 0
     """Seed of the choice of rows."""
     repair: bool = False
-    """Begin a new build without the damaged parts; stages.extract completes it."""
+    """Make a damaged store again: keep its sound rows, compute the others."""
     checkpoint: Place | Literal[True] | None = None
     """Instead of a store, check that the model of `vlm` computes the features that this checkpoint
     was trained on; true: the checkpoint in `train_head.output`."""
-    threads: int = Field(default=4, ge=1, le=256)
-    """Threads of this process that read and check."""
-    workers: Workers = 0
-    """0: this process; N: local processes; or the address of a dask scheduler."""
 
 
 class ArchiveParams(Section):
