@@ -21,7 +21,7 @@ from tqdm import tqdm
 from pipeline.base.border import Border, Document
 from pipeline.base.errors import ConfigError
 from pipeline.base.files import OutputKind, replace_folder, there, write_document
-from pipeline.data.lerobot_writer import FilmedRows, write_filmed_v30
+from pipeline.data.lerobot_writer import LeRobotEpisode, write_data_set
 from pipeline.simulation.meta_world import (
     ACTION,
     HZ,
@@ -69,7 +69,7 @@ class Demonstration(NamedTuple):
     """A finished episode; `rows` is None where the expert failed."""
 
     seed: int
-    rows: FilmedRows | None
+    rows: LeRobotEpisode | None
 
 
 def seeds_of(purpose: Purpose, run: int) -> range:
@@ -114,7 +114,7 @@ def _record_set(
     def on_a_core(seed: int) -> Demonstration:
         return pool.submit(demonstrate, wanted, seed).result()
 
-    def kept() -> Iterator[FilmedRows]:
+    def kept() -> Iterator[LeRobotEpisode]:
         tried = seeds_of("demonstrations", wanted.run)[: _TRIED * wanted.episodes]
         shown = in_background(tried, on_a_core, jobs)
         with closing(shown):
@@ -135,7 +135,7 @@ def _record_set(
         moves = {"names": list(ACTION.names), "units": list(ACTION.units), "kind": "delta"}
         features = {"observation.state": units, "action": moves}
         task = instruction_of(wanted.task)
-        write_filmed_v30(folder, kept(), features, task, HZ, "meta_world_sawyer")
+        write_data_set(folder, kept(), features, task, HZ, "meta_world_sawyer")
         document = wanted.model_dump(mode="json") | {"seeds": seeds[True], "failed": seeds[False]}
         write_document(folder / RECORD, document)
 
@@ -160,7 +160,7 @@ def demonstrate(wanted: Record, seed: int) -> Demonstration:
         "timestamp": (np.arange(len(states)) / HZ).astype(np.float32),
     }
     film = {f"observation.images.{VIEW}": np.stack(frames)}
-    return Demonstration(seed, FilmedRows(columns, film) if environment.success else None)
+    return Demonstration(seed, LeRobotEpisode(columns, film) if environment.success else None)
 
 
 def recorded(out: Path, task: str) -> Record:

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from pipeline.base.config import Source
 from pipeline.base.errors import RecordingError
-from pipeline.data.discovery import READERS, episode_folders, listing
+from pipeline.data.discovery import READERS, episode_folders
 from pipeline.data.recording import (
     ActionKind,
     CameraStream,
@@ -21,6 +21,7 @@ from pipeline.data.recording import (
     Stream,
     absolute,
     content_digest,
+    entries,
     natural_key,
 )
 
@@ -105,7 +106,7 @@ def open_recording(
     Raises `RecordingError` where it is missing or no longer of that format.
     """
     reader, source = READERS[format], Source(name=format, path=str(path))
-    if not reader.marks(path, listing(path)):
+    if not reader.marks(path, [entry.name for entry in entries(path)]):
         raise RecordingError(f"{path}: not of the format {format} (no {reader.marker})")
     episodes, _ = reader.open(path, source, views)
     # An id that occurs more than once in its source has parent folders before it.

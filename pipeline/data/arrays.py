@@ -2,27 +2,25 @@
 
 import csv
 import zipfile
-from array import array
-from collections.abc import Collection, Iterator, Mapping, Sequence
-from functools import partial
-from math import prod
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import IO, Any
 
 import numpy as np
+import pyarrow as pa
 from numpy.lib import format as npy
 from numpy.typing import NDArray
+from pyarrow import csv as arrow_csv
 
-from pipeline.base.border import shown
+from pipeline.base.border import named, shown
 from pipeline.base.config import MediaLimits
 from pipeline.base.errors import RecordingError
-from pipeline.data.recording import DEFAULT_LIMITS, INTACT, RECORDINGS, check_unpacked
+from pipeline.data.recording import DEFAULT_LIMITS, RECORDINGS, check_unpacked
 
 Numbers = NDArray[Any]
 """An array of real numbers of any width."""
-_HEADERS = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}
-MOST_CHANNELS = 65_536
-_LONGEST_LINE = 2**20
+_MOST_CSV_BYTES = 2**30
+"""Largest CSV: a day of robot states at 100 Hz has half of it."""
 
 
 def read_npz(
@@ -34,8 +32,8 @@ def read_npz(
     """The members of a .npz named in `wanted` (numbers) or in `text` (words).
 
     A missing member is left out, but at least one must be there. Raises `RecordingError`, which
-    names file and member, where one is truncated, damaged, larger than the limits, or of another
-    type; object arrays are refused unread.
+    names file and member, where one is truncated, damaged, larger than the limits, or not of
+    numbers; a pickle inside is never opened.
     """
     members: dict[str, NDArray[Any]] = {}
     RECORDINGS.check_file(path)
@@ -43,45 +41,30 @@ def read_npz(
         for info in archive.infolist():
             name = info.filename.removesuffix(".npy")
             where = f"{path}, member {name!r}"
-            if name in members:
-                raise RECORDINGS.refusal(where, "expected once, found twice")
             if name in wanted or name in text:
-                check_unpacked(where, info.file_size, info.compress_size, limits)
+                check_unpacked(where, info.file_size, limits)
                 with RECORDINGS.foreign(where, "cannot be read"), archive.open(info) as file:
-                    read = _read_array(file, info.file_size, where)
-                members[name] = numeric(read, where) if name in wanted else _words(read, where)
+                    read = _read_array(file, where)
+                members[name] = numeric(read, where) if name in wanted else read
         if not members:
             names = [name.removesuffix(".npy") for name in archive.namelist()]
-            raise RecordingError(f"{path}: expected {' or '.join(wanted)}, found {_listed(names)}")
+            raise RecordingError(f"{path}: expected {' or '.join(wanted)}, found {shown(names)}")
     return members
 
 
 def read_npy(path: Path, limits: MediaLimits = DEFAULT_LIMITS) -> Numbers:
     """The one array of a .npy; errors as in `read_npz`."""
-    size = RECORDINGS.check_file(path)
-    check_unpacked(path, size, size, limits)
+    check_unpacked(path, RECORDINGS.check_file(path), limits)
     with RECORDINGS.foreign(path, "cannot be read as .npy"), path.open("rb") as file:
-        return numeric(_read_array(file, size, str(path)), str(path))
+        return numeric(_read_array(file, str(path)), str(path))
 
 
-def _read_array(file: IO[bytes], size: int, where: str) -> NDArray[Any]:
-    """The array of numbers or words in an open file of `size` bytes."""
+def _read_array(file: IO[bytes], where: str) -> NDArray[Any]:
     try:
-        shape, _, dtype = _HEADERS[npy.read_magic(file)](file)
-    except Exception:  # A damaged header makes numpy's parser raise almost any exception.
-        why = "cannot be read as an array: its header is damaged or not numpy's"
+        return npy.read_array(file, allow_pickle=False)
+    except (ValueError, MemoryError):  # numpy advises to open a pickle, which could run code
+        why = "cannot be read as an array: cut off, damaged, of objects, or too large for memory"
         raise RECORDINGS.refusal(where, why) from None
-    if dtype.kind not in "biufU":
-        raise RECORDINGS.refusal(where, f"expected an array of numbers, found {dtype.name[:80]}")
-    rest = size - file.tell()
-    whole = all(type(n) is int and n >= 0 for n in shape)
-    if not whole or prod(shape) * dtype.itemsize != rest:
-        why = f"cannot be read: {shown(shape)} of {dtype} is not what its {rest:,} bytes hold"
-        raise RECORDINGS.refusal(where, why)
-    if not rest and shape[:1] > (0,):
-        raise INTACT.refusal(where, f"expected rows with values, found {shown(shape)} of {dtype}")
-    file.seek(0)
-    return npy.read_array(file, allow_pickle=False)
 
 
 def member(members: Mapping[str, Numbers], names: Sequence[str], path: Path) -> Numbers:
@@ -90,94 +73,73 @@ def member(members: Mapping[str, Numbers], names: Sequence[str], path: Path) -> 
         if name in members:
             return members[name]
     raise RecordingError(
-        f"{path}: no member {' or '.join(map(repr, names))}; it has {_listed(members)}"
+        f"{path}: no member {' or '.join(map(repr, names))}; it has {shown([*members])}"
     )
 
 
 def numeric(array: Any, where: str) -> Numbers:
     """The array; `RecordingError` unless it holds rows of real numbers."""
-    if not isinstance(array, np.ndarray) or array.dtype.kind not in "fiu":
+    if not isinstance(array, np.ndarray) or array.dtype.kind not in "fiu" or array.ndim == 0:
         kind = getattr(array, "dtype", type(array).__name__)
-        raise RecordingError(f"{where}: expected an array of numbers, found {kind}")
-    if array.ndim == 0:
-        raise RecordingError(f"{where}: expected rows of numbers, found the single {array}")
-    return array
-
-
-def _words(array: NDArray[Any], where: str) -> NDArray[Any]:
-    if array.dtype.kind != "U" or array.ndim != 1 or len(array) > MOST_CHANNELS:
-        why = f"expected a list of at most {MOST_CHANNELS:,} words, found {array.dtype} of shape "
-        raise INTACT.refusal(where, f"{why}{array.shape}")
+        shape = getattr(array, "shape", "")
+        raise RecordingError(f"{where}: expected rows of numbers, found {kind} {shape}")
     return array
 
 
 def csv_header(path: Path) -> list[str]:
     """Column names of a CSV."""
-    return [name.strip() for name in next(_csv_lines(path), (0, []))[1]]
+    RECORDINGS.check_file(path, _MOST_CSV_BYTES)
+    with (
+        RECORDINGS.foreign(path, "cannot be read as CSV"),
+        path.open(newline="", encoding="utf-8-sig") as file,
+    ):
+        return [name.strip() for name in next(csv.reader(file), [])]
 
 
 def read_csv(path: Path, columns: Sequence[str]) -> NDArray[np.float64]:
     """The named columns (row, column) of a CSV with a header line, found by name.
 
-    Raises `RecordingError`, which names missing or repeated columns, the line of a row that is
-    longer or shorter than the header, or the line and column of a bad cell.
+    Raises `RecordingError`, which names missing or repeated columns, the row that is longer or
+    shorter than the header, or the row and column of a bad cell.
     """
-    lines = _csv_lines(path)
-    header = [name.strip() for name in next(lines, (0, []))[1]]
-    for count, what in ((0, "missing column(s)"), (2, "twice the column(s)")):
-        wrong = [name for name in columns if min(header.count(name), 2) == count]
-        if wrong:
-            raise RecordingError(f"{path}: {what} {', '.join(wrong)}; it has {_listed(header)}")
-    places = [header.index(name) for name in columns]
-    table = array("d")
-    for line, row in lines:
-        _check_width(path, line, row, header)
-        try:
-            # float() also accepts 1_000 and digits of other scripts; a table may not have them.
-            table.extend(float(row[place].replace("_", "?").encode("ascii")) for place in places)
-        except ValueError:
-            column = len(table) % len(columns)
-            raise RecordingError(
-                f"{path}, line {line}, column {columns[column]!r}: {shown(row[places[column]])} "
-                "is not a number"
-            ) from None
-    return np.frombuffer(table, np.float64).reshape(-1, len(columns))
-
-
-def _csv_lines(path: Path) -> Iterator[tuple[int, list[str]]]:
-    """Number and cells of each line that is not empty."""
-    RECORDINGS.check_file(path)
-    with (
-        RECORDINGS.foreign(path, "cannot be read as CSV"),
-        path.open(newline="", encoding="utf-8-sig") as file,
-    ):
-        reader = csv.reader(_bounded_lines(file, path))
-        yield from ((reader.line_num, row) for row in reader if row)
-
-
-def _bounded_lines(file: IO[str], path: Path) -> Iterator[str]:
-    for number, line in enumerate(iter(partial(file.readline, _LONGEST_LINE), ""), start=1):
-        if len(line) == _LONGEST_LINE:
-            why = f"expected lines of fewer than {_LONGEST_LINE:,} characters, found more"
-            raise RECORDINGS.refusal(f"{path}, line {number}", why)
-        yield line
-
-
-def _check_width(path: Path, line: int, row: Sequence[str], header: Sequence[str]) -> None:
-    """Raise `RecordingError` for a row of more or fewer cells than the header names.
-
-    It is unknown which cell is missing or extra, so every value may belong to a neighbouring
-    channel. Empty cells at the end, from a trailing comma, shift nothing.
-    """
-    expected = len(header)
-    if len(row) != expected and any((*row[expected:], *header[len(row) :])):
-        why = "the line is cut off" if len(row) < expected else "its channels would be shifted"
+    header = csv_header(path)
+    if wrong := [name for name in columns if header.count(name) != 1]:
         raise RecordingError(
-            f"{path}, line {line}: expected {expected} cells as in the header, found {len(row)}; "
-            f"{why}. Mend or delete the line"
+            f"{path}: expected one column {', '.join(wrong)} each; it has "
+            f"{named(', '.join(header)[:900])}"
         )
+    read = arrow_csv.ReadOptions(column_names=header, skip_rows=1, use_threads=False)
+    convert = arrow_csv.ConvertOptions(
+        include_columns=list(columns), column_types=dict.fromkeys(columns, pa.float64())
+    )
+    with RECORDINGS.foreign(path, "cannot be read as CSV"):
+        table = arrow_csv.read_csv(path, read_options=read, convert_options=convert)
+    cells = [matrix(table[name], 1, f"{path}, column {name!r}") for name in columns]
+    return np.concatenate(cells, axis=1)
 
 
-def _listed(names: Collection[str]) -> str:
-    more = f", and {len(names) - 50:,} more" if len(names) > 50 else ""
-    return ", ".join(shown(name)[1:-1] for name in [*names][:50]) + more or "nothing"
+def matrix(column: pa.ChunkedArray, width: int, where: str) -> NDArray[np.float64]:
+    """A column of vectors, or of numbers if the width is 1, as (row, width)."""
+    array = column.combine_chunks()
+    if array.null_count:
+        raise RECORDINGS.refusal(where, f"no value in row {int(np.argmax(array.is_null()))}")
+    if isinstance(array, pa.ListArray | pa.LargeListArray | pa.FixedSizeListArray):
+        fixed = isinstance(array, pa.FixedSizeListArray)
+        lengths = np.array([array.type.list_size]) if fixed else _numbers(array.value_lengths())
+        if (lengths != width).any():
+            row = int(np.argmax(lengths != width))
+            why = f"{lengths[row]} values in row {row}, but its feature has {width}"
+            raise RECORDINGS.refusal(where, why)
+        array = array.flatten()
+    values = _numbers(array)
+    if values.size != len(column) * width:
+        raise RECORDINGS.refusal(where, f"one number a row, but its feature has {width}")
+    return values.astype(np.float64).reshape(len(column), width)
+
+
+def _numbers(array: pa.Array) -> NDArray[Any]:
+    """An array of numbers, NaN for a null; not with `to_numpy`, which would import pandas."""
+    if array.null_count:
+        array = array.cast(pa.float64()).fill_null(np.nan)
+    dtype = np.dtype(array.type.to_pandas_dtype())
+    return np.frombuffer(array.buffers()[1], dtype, len(array), array.offset * dtype.itemsize)

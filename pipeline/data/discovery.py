@@ -5,16 +5,14 @@ import os
 import re
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass
-from fnmatch import filter as matching
-from itertools import chain, islice
 from pathlib import Path
 
 from pipeline.base.border import shown
 from pipeline.base.commands import command
 from pipeline.base.config import Source
-from pipeline.base.errors import RecordingError
+from pipeline.base.errors import ConfigError, RecordingError
+from pipeline.base.hub import network_errors
 from pipeline.data import lerobot, pickled, raw, windowed
-from pipeline.data.hub import hub_folder
 from pipeline.data.recording import Recording, absolute, entries, natural_key
 
 Opener = Callable[[Path, Source, Sequence[str] | None], tuple[Sequence[Recording], Sequence[str]]]
@@ -43,27 +41,8 @@ READERS = {
 }
 """In the order of detection."""
 
-_FOREIGN = {
-    "*.tfrecord* *.tfrecords*": "RLDS, the TFRecord files of Open X-Embodiment",
-    ".zgroup .zarray": "a zarr replay buffer, as UMI and Diffusion Policy write them",
-    "*.hdf5 *.h5": "HDF5, as robomimic and ALOHA write it",
-    "*.bag *.mcap *.db3": "a ROS bag",
-    "*.parquet": "LeRobot without its meta/info.json, or other parquet files",
-    "*.npz *.npy *.csv *.tsv *.pkl *.pickle *.pt": "arrays or tables of another recorder",
-    "*.mp4 *.avi *.mkv *.mov *.webm *.jpg *.jpeg *.png": "images alone, without their actions",
-}
-"""Formats without a reader, by file name patterns; the first match decides."""
-
-_ON_THE_HUB = (
-    "For a data set on the Hugging Face Hub, give the source hub: owner/name in place of path"
-)
-
 _ODD = re.compile(r"[\x00-\x1f\x7f\ud800-\udfff]")
 """Control characters, and bytes of a name that are not UTF-8."""
-_MOST_LOOKED_AT = 1000
-"""Most folders searched for such names."""
-_DEEPEST = 4
-"""Levels below a LeRobot root at which its files lie: videos/chunk-000/view/episode.mp4."""
 
 
 def episode_folders(source: Source, root: Path) -> list[tuple[Path, FormatReader]]:
@@ -73,25 +52,22 @@ def episode_folders(source: Source, root: Path) -> list[tuple[Path, FormatReader
     characters, because a store could not keep it.
     """
     unique: dict[Path, tuple[Path, FormatReader]] = {}
-    for pattern in source.paths if source.hub is None else [str(hub_folder(source))]:
+    for pattern in source.paths if source.hub is None else [str(_hub_folder(source))]:
         full = absolute(root / pattern)
         matches = _matches(full)
         if not matches:
-            lost = "" if root.is_dir() else f": {root} is no folder; see {command('doctor')}"
-            files = glob.glob(str(full), recursive=True)  # noqa: PTH207
-            hint = meant(Path(files[0]) if files else full) or _ON_THE_HUB
             raise RecordingError(
                 f"source {source.name!r}: {pattern!r} matches nothing; looked for folders {full}. "
-                f"Mend data.root or the source's path{lost}. {hint}"
+                f"Mend data.root or the source's path; `{command('doctor')}` looks at both. For a "
+                "data set on the Hugging Face Hub, give hub: owner/name in place of path"
             )
         episodes = [pair for match in matches for pair in _episodes(match, source)]
         if not episodes:
-            wanted = [source.format] if source.format in READERS else list(READERS)
-            markers = ", or ".join(READERS[format].marker for format in wanted)
+            markers = ", or ".join(reader.marker for reader in READERS.values())
             raise RecordingError(
                 f"source {source.name!r}: {pattern!r} matches {len(matches)} folder(s), none with "
-                f"an episode in it; looked under {full} for folders with {markers}. "
-                f"{meant(matches[0]) or 'Mend the path or format'}"
+                f"an episode in it; looked under {full} for folders with {markers}. Mend the path; "
+                "convert another format to LeRobot, or write a reader: docs/recipes/reader.md"
             )
         for folder, reader in episodes:
             _check_name(source, folder)
@@ -99,12 +75,33 @@ def episode_folders(source: Source, root: Path) -> list[tuple[Path, FormatReader
     return sorted(unique.values(), key=lambda pair: natural_key(pair[0]))
 
 
+def _hub_folder(source: Source) -> Path:
+    """The folder of a source's data set in the Hub's cache.
+
+    Files that the Hub's cache lacks are downloaded; without network, what it has of that revision
+    is used. Raises `ConfigError` where there is neither.
+    """
+    from huggingface_hub import snapshot_download
+    from huggingface_hub.errors import HFValidationError
+
+    assert source.hub is not None
+    repo, _, revision = source.hub.partition("@")
+    try:
+        return Path(snapshot_download(repo, repo_type="dataset", revision=revision or None))
+    except (HFValidationError, *network_errors()) as error:
+        why = (str(error).strip() or type(error).__name__).splitlines()[0].rstrip(".")
+        at = f" --revision {revision}" if revision else ""
+        raise ConfigError(
+            f"source {source.name!r}: hub {source.hub}: cannot be downloaded: {why}. Look at the "
+            f"id, or run `hf download --repo-type dataset {repo}{at}` where there is network and "
+            "give its folder as the source's path. A gated set needs `hf auth login`"
+        ) from error
+
+
 def _matches(full: Path) -> list[Path]:
-    """The folders of a path or glob; a final `/**` is dropped, because all below is searched."""
+    """The folders of a path or glob."""
     if _is_folder(full):
         return [full]
-    while full.name == "**":
-        full = full.parent
     # glob follows symbolic links, as data folders often are; pathlib's ** does not.
     matches = [Path(match) for match in glob.glob(str(full), recursive=True)]  # noqa: PTH207
     return sorted(filter(_is_folder, matches), key=natural_key)
@@ -127,61 +124,18 @@ def _episodes(start: Path, source: Source) -> Iterator[tuple[Path, FormatReader]
         if format is not None:
             yield folder, READERS[format]
         else:
-            below = (entry for entry in listed if not entry.name.startswith("."))
-            # A listing tells folders from files without a call for each.
-            pending += [
-                Path(entry.path)
-                for entry in below
-                if (_is_folder(Path(entry.path)) if entry.is_symlink() else entry.is_dir())
-            ]
+            below = (Path(entry.path) for entry in listed if not entry.name.startswith("."))
+            pending += filter(_is_folder, below)
 
 
 def _detect(folder: Path, names: Collection[str], source: Source) -> str | None:
-    if source.format != "auto" and READERS[source.format].marks(folder, names):
-        return source.format
-    format = _format(folder, names)
-    if format is not None and source.format != "auto":
-        raise RecordingError(
-            f"source {source.name!r}: {folder} is not of the format {source.format!r} that params "
-            f"ask for (no {READERS[source.format].marker}), it looks like {format!r} "
-            f"({READERS[format].marker}). Set the source's format to auto or {format}"
-        )
-    return format
-
-
-def meant(path: Path) -> str:
-    """A hint about a path without an episode: its parent episode or its format; '' if unknown."""
-    for folder in path.parents[:_DEEPEST]:
-        if not (folder.is_dir() and os.access(folder, os.R_OK)):
-            continue
-        format = _format(folder, listing(folder))
-        if format is not None:
-            what = "a LeRobot data set" if format == "lerobot" else f"an episode ({format!r})"
-            return f"Did you mean {folder}, which is {what}?"
-    return _foreign(path)
-
-
-def _foreign(path: Path) -> str:
-    """A hint about a format without a reader, and what to do; '' if unknown.
-
-    Zarr v3 groups, such as this project's stores, are skipped.
-    """
-    if not os.path.exists(path):  # noqa: PTH110, it accepts a name that is too long
-        return ""
-    names = {path.name.lower()}
-    for _, below, files in islice(os.walk(path), _MOST_LOOKED_AT):
-        if "zarr.json" in files:
-            below.clear()
-        else:
-            names |= {name.lower() for name in (*below, *files)}
-    for patterns, what in _FOREIGN.items():
-        fitting = sorted(chain.from_iterable(matching(names, end) for end in patterns.split()))
-        if fitting:
-            return (
-                f"It looks like {what} ({fitting[0]}), which this project does not read. Convert "
-                "it to LeRobot, or write a reader: docs/recipes/reader.md"
-            )
-    return ""
+    marked = [format for format, reader in READERS.items() if reader.marks(folder, names)]
+    if source.format == "auto" or not marked or source.format in marked:
+        return source.format if source.format in marked else next(iter(marked), None)
+    raise RecordingError(
+        f"source {source.name!r}: expected the format {source.format!r}, found {marked[0]!r} in "
+        f"{folder} ({READERS[marked[0]].marker}). Set the source's format to auto or {marked[0]}"
+    )
 
 
 def _check_name(source: Source, folder: Path) -> None:
@@ -190,12 +144,3 @@ def _check_name(source: Source, folder: Path) -> None:
             f"source {source.name!r}: the name of {shown(str(folder))} is not UTF-8 or holds a "
             f"control character, {shown(odd[0])}, which no store could keep. Rename the folder"
         )
-
-
-def _format(folder: Path, names: Collection[str]) -> str | None:
-    return next((name for name, reader in READERS.items() if reader.marks(folder, names)), None)
-
-
-def listing(folder: Path) -> list[str]:
-    """The names in a folder; `RecordingError` where it cannot be read."""
-    return [entry.name for entry in entries(folder)]

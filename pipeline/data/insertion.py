@@ -13,12 +13,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.base.border import Document
 from pipeline.base.config import MediaLimits
 from pipeline.base.errors import RecordingError
 from pipeline.data.arrays import Numbers, csv_header, member, read_csv, read_npz
 from pipeline.data.jpeg import JpegCamera
 from pipeline.data.recording import (
+    RECORDINGS,
     CameraStream,
     Channels,
     Recording,
@@ -83,20 +83,6 @@ class InsertionRecording(Recording):
     @abstractmethod
     def _data_files(self) -> Sequence[Path | None]:
         """Paths of the files that are not frames, whether they exist or not."""
-
-
-def promised(metadata: Document, **keys: Sequence[str]) -> dict[str, str]:
-    """The metadata entry which says that a stream was recorded: the first of its keys that is set.
-
-    A stream is left out if that entry is 0 or false.
-    """
-    evidence: dict[str, str] = {}
-    for stream, names in keys.items():
-        entries = [(key, getattr(metadata, key)) for key in names]
-        key, value = next((entry for entry in entries if entry[1] is not None), ("", None))
-        if value:
-            evidence[stream] = f"{key} {value}"
-    return evidence
 
 
 def robot_state_file(folder: Path) -> Path | None:
@@ -169,16 +155,8 @@ def sensor_rows(force: Numbers, aline: Numbers, where: str) -> NDArray[np.float3
 
 def _states_of_npz(path: Path, limits: MediaLimits) -> Numbers:
     members = read_npz(path, ("robot_states", "joints", "poses"), limits=limits)
-    counts = {name: len(array) for name, array in members.items() if array.ndim == 2}
-    if len(set(counts.values())) > 1:
-        raise RecordingError(
-            f"{path}: {', '.join(f'{n} {name}' for name, n in counts.items())}; they must agree"
-        )
     if "robot_states" in members:
         return members["robot_states"]
     halves = [member(members, (name,), path) for name in ("joints", "poses")]
-    if any(half.ndim != 2 for half in halves):
-        raise RecordingError(
-            f"{path}: expected joints and poses (M, 6), found {[half.shape for half in halves]}"
-        )
-    return np.concatenate(halves, axis=1)
+    with RECORDINGS.foreign(path, "expected joints and poses (M, 6)"):
+        return np.concatenate(halves, axis=1)

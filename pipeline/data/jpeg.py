@@ -2,13 +2,11 @@
 
 import math
 import os
-import re
 from collections import Counter, defaultdict
-from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Generator, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from filecmp import cmp
 from io import BytesIO
-from itertools import pairwise
 from pathlib import Path, PurePath
 from typing import TypeVar
 
@@ -22,7 +20,6 @@ from pipeline.base.errors import RecordingError
 from pipeline.data.recording import (
     DEFAULT_LIMITS,
     FARTHEST_S,
-    INTACT,
     RECORDINGS,
     CameraStream,
     check_limit,
@@ -37,21 +34,13 @@ Frame = TypeVar("Frame")
 _EYES = ("left", "right")
 _SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".gif", ".tif", ".tiff", ".webp")
 """Suffixes of images; those that cannot be decoded are refused with their name."""
-_PADDED = re.compile(r"0\d+")
-"""A frame number in place of a time: 000001."""
 _COUNTS = 1e6
 """Whole numbers below it count frames; a clock in whole seconds since 1970 is above 1e9."""
-_VIEW = re.compile(r"view(?=\d)", re.IGNORECASE)
 _FORMATS = ("JPEG", "PNG")
 _AS_RGB = ("1", "L", "LA", "P", "PA", "RGB", "RGBA", "CMYK")
 """Modes of images that are converted to RGB; transparent pixels become opaque."""
-_SIXTEEN_BITS = ("I;16", "I;16B", "I;16L", "I;16N")
-"""Modes of grey images of 16 bits; the upper eight bits are kept."""
 _IMAGE_BYTES = 16 * 2**20
 """Bytes that an image file may have above one per pixel of the limits; a JPEG has about half."""
-_SCAN, _MOST_SCANS = b"\xff\xda", 100
-"""A progressive JPEG has about ten scans; each goes over all pixels again."""
-
 Image.MAX_IMAGE_PIXELS = None  # The header is compared with the source's limits instead.
 
 
@@ -67,8 +56,7 @@ class JpegCamera(CameraStream):
         frames of two cameras.
         """
         timed = sorted((frame_time(path), str(path)) for path in paths)
-        _check_one_camera(view, timed)
-        _check_not_counted(timed)
+        _check_names(view, set(timed))
         self.view = view
         self.paths = [Path(path) for _, path in timed]
         self.time = np.array([time for time, _ in timed], np.float64)
@@ -104,18 +92,28 @@ def frame_time(path: PurePath) -> float:
         time = float(text)
     except ValueError:
         time = math.nan
-    if not abs(time) <= FARTHEST_S or _PADDED.fullmatch(text):
+    if not abs(time) <= FARTHEST_S:
         raise _no_time(path, shown(text))
     return time
 
 
-def _check_not_counted(timed: Sequence[tuple[float, str]]) -> None:
-    """Raise `RecordingError` where the names only count the frames: whole numbers below 1e6."""
-    if len(timed) < 2 or timed[-1][0] >= _COUNTS:
-        return
-    if all(PurePath(path).stem.rpartition("_")[2].isdecimal() for _, path in timed):  # not 1.0
-        first, last = timed[0][0], timed[-1][0]
-        raise _no_time(Path(timed[-1][1]), f"frames counted from {first:g} to {last:g}")
+def _check_names(view: str, timed: Collection[tuple[float, str]]) -> None:
+    """Raise `RecordingError` where frames are numbered, or of two cameras or in two forms.
+
+    The part of a name before the time is the camera's name, or a number of the frame's own.
+    """
+    names = [os.path.basename(path).rpartition(".")[0] for _, path in timed]  # noqa: PTH119
+    before, _, last = zip(*(name.rpartition("_") for name in names), strict=True)
+    _, path = max(timed)
+    if max(timed)[0] < _COUNTS and all(map(str.isdecimal, last)):  # not 1.0
+        raise _no_time(Path(path), "the number of a frame")
+    cameras, times = set(before), {time for time, _ in timed}
+    if 1 < len(cameras) < len(names) or len(times) < len(timed):
+        raise RecordingError(
+            f"{path}: expected the frames of one camera in {view}, at different times; found "
+            f"{len(cameras)} name(s) and {len(times)} times for {len(timed)} frames. Move those of "
+            "another camera or form into a folder of their own"
+        )
 
 
 def _no_time(path: PurePath, name: str) -> RecordingError:
@@ -125,51 +123,19 @@ def _no_time(path: PurePath, name: str) -> RecordingError:
     )
 
 
-def _check_one_camera(view: str, timed: Sequence[tuple[float, str]]) -> None:
-    """Raise `RecordingError` where frames (sorted by time) are of two cameras or in two forms.
-
-    The part of a name before the time is the camera's name, or a number of the frame's own.
-    """
-    names = {path: os.path.basename(path).rpartition("_")[0] for _, path in timed}  # noqa: PTH119
-    of_camera = {name: path for path, name in names.items()}
-    pairs = [[a, b] for (at, a), (then, b) in pairwise(timed) if at == then and a != b]
-    if 1 < len(of_camera) < len(names):
-        pairs.append([*of_camera.values()])
-    if pairs:
-        raise _two_cameras(view, *pairs[0][:2])
-
-
-def _two_cameras(view: str, first: str | Path, other: str | Path) -> RecordingError:
-    return RecordingError(
-        f"{first}: expected the frames of one camera in {view}, found also {other}. Move those "
-        "of another camera or form into a folder of their own"
-    )
-
-
 def list_views(folder: Path, prefix: str = "") -> dict[str, list[Path]]:
-    """Images by view name, from the folders `<prefix>…` in `folder`; without empty views.
+    """Images by view name, from the folders `<prefix>…` in `folder` (`view1` too); none is empty.
 
-    `left` is dropped unless both eyes exist. The eye is a subfolder, the end of the folder's name,
-    or the part of a file's name before the time.
+    `left` is dropped unless both eyes exist. The eye is a subfolder, or ends the folder's name.
     """
     frames: dict[tuple[str, str], list[Path]] = defaultdict(list)
-    for view in _view_folders(folder, prefix):
-        base, _ = split_eye(view.name)
-        firsts: dict[str, Path] = {}
-        for eye, path in _frames(view):
-            frames[base, eye].append(path)
-            firsts.setdefault(eye, path)
-        if "" in firsts and len(firsts) > 1:
-            first, other, *_ = firsts.values()
-            raise _two_cameras(view.name, first, other)
-    return name_views(frames)
-
-
-def list_empty_views(folder: Path, prefix: str = "") -> list[str]:
-    """The folders `<prefix>…` in `folder` with no image in them or their eyes' subfolders."""
-    return [
-        view.name for view in _view_folders(folder, prefix) if next(_frames(view), None) is None
-    ]
+    for view in _folders(folder):
+        if view.name.lower().startswith(prefix.lower()):
+            base, eye = split_eye(view.name)
+            frames[base, eye] += _images(view)
+            for name in _EYES:
+                frames[base, name] += _images(view / name)
+    return name_views({key: paths for key, paths in frames.items() if paths})
 
 
 def name_views(frames: Mapping[tuple[str, str], list[Frame]]) -> dict[str, list[Frame]]:
@@ -182,8 +148,7 @@ def name_views(frames: Mapping[tuple[str, str], list[Frame]]) -> dict[str, list[
 
 
 def split_eye(name: str) -> tuple[str, str]:
-    """`View1_left` and `view1_left` -> (`View1`, `left`); the eye is '' if there is none."""
-    name = _VIEW.sub("View", name, count=1) if _VIEW.match(name) else name
+    """`View1_left` -> (`View1`, `left`); the eye is '' if there is none."""
     base, _, eye = name.rpartition("_")
     return (base, eye) if base and eye in _EYES else (name, "")
 
@@ -193,9 +158,6 @@ def read_image(
 ) -> NDArray[np.uint8]:
     """The image (height, width, 3), RGB as stored (EXIF orientation is ignored)."""
     with _opened_image(file, where, limits) as image:
-        if image.mode in _SIXTEEN_BITS:
-            upper = (np.asarray(image) >> 8).astype(np.uint8)
-            return np.repeat(upper[:, :, None], 3, axis=2)
         image.info.pop("transparency", None)  # Pillow would warn about a palette's transparency
         return np.asarray(image.convert("RGB"))
 
@@ -236,12 +198,10 @@ def _opened_image(
             raise RECORDINGS.refusal(where, why) from None
         with image:
             check_limit(where, image.width * image.height, limits.pixels, "pixels", "pixels")
-            if image.mode not in _AS_RGB + _SIXTEEN_BITS:
-                why = f"expected pixels of 8 bits, or grey ones of 16, found mode {image.mode!r}"
-                raise INTACT.refusal(where, why)
-            if image.format == "JPEG" and (scans := file.count(_SCAN)) > _MOST_SCANS:
-                why = f"expected at most {_MOST_SCANS} scans over the image, found {scans:,}"
-                raise INTACT.refusal(where, why)
+            if image.mode not in _AS_RGB:
+                raise RECORDINGS.refusal(
+                    where, f"expected pixels of 8 bits, found mode {image.mode!r}"
+                )
             yield image
 
 
@@ -252,40 +212,13 @@ def check_image_file(file: Path, limits: MediaLimits) -> int:
     return size
 
 
-def _view_folders(folder: Path, prefix: str) -> list[Path]:
-    views = [
-        Path(entry.path)
-        for entry in _entries(folder)
-        if split_eye(entry.name)[0].startswith(prefix) and entry.is_dir()
-    ]
-    for view, other in pairwise(sorted(views, key=lambda view: split_eye(view.name))):
-        if split_eye(view.name) == split_eye(other.name):
-            raise RecordingError(
-                f"{view}: expected one folder of this view, found {other}. Rename it"
-            )
-    return sorted(views, key=lambda view: natural_key(view.name))
-
-
-def _frames(view: Path) -> Iterator[tuple[str, Path]]:
-    """(eye, file) of every image of a view's folder."""
-    _, eye = split_eye(view.name)
-    for entry in _entries(view):
-        if entry.name in _EYES and entry.is_dir():
-            inside = _entries(Path(entry.path))
-            yield from ((entry.name, Path(file.path)) for file in inside if _is_image(file.name))
-        elif _is_image(entry.name):
-            yield eye or _eye_of_file(entry.name), Path(entry.path)
-
-
-def _entries(folder: Path) -> Iterable[os.DirEntry[str]]:
+def _folders(folder: Path) -> list[Path]:
+    """The folders in a folder, in natural order; none where it is not there."""
     listed = entries(folder) if folder.is_dir() else []
-    return [entry for entry in listed if not entry.name.startswith(".")]
+    return sorted((Path(entry.path) for entry in listed if entry.is_dir()), key=natural_key)
 
 
-def _is_image(name: str) -> bool:
-    return name.lower().endswith(_SUFFIXES)
-
-
-def _eye_of_file(name: str) -> str:
-    parts = name.split("_")
-    return parts[-2] if len(parts) > 2 and parts[-2] in _EYES else ""
+def _images(folder: Path) -> list[Path]:
+    listed = entries(folder) if folder.is_dir() else []
+    names = [entry.name for entry in listed if not entry.name.startswith(".")]
+    return [folder / name for name in names if name.lower().endswith(_SUFFIXES)]

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from pipeline.base.border import Text, shown, uncollected
 from pipeline.base.config import MediaLimits, Source
 from pipeline.base.errors import RecordingError
-from pipeline.data.arrays import MOST_CHANNELS, member, read_npz
+from pipeline.data.arrays import matrix, member, read_npz
 from pipeline.data.insertion import SENSOR
 from pipeline.data.lerobot_meta import (
     MARKER,
@@ -40,7 +40,6 @@ from pipeline.data.lerobot_rows import (
     ParquetRows,
     ParquetTable,
     check_frames,
-    matrix,
     read_clock,
     stored_clock,
 )
@@ -49,7 +48,6 @@ from pipeline.data.recording import (
     ActionKind,
     CameraStream,
     Channels,
-    Nominal,
     RecordedAction,
     Recording,
     Stream,
@@ -60,6 +58,7 @@ from pipeline.data.video import VideoClip, VideoSpan
 
 STATE = "observation.state"
 ACTION = "action"
+_MOST_CHANNELS = 65_536
 _SIDECARS = ("sensor", "state", "frames")
 _DELTA = re.compile(r"delta.*|d(x|y|z|a|b|r|rx|ry|rz|alpha|beta|gamma|roll|pitch|yaw)")
 
@@ -75,16 +74,11 @@ def open_data_set(
 ) -> tuple[list["LeRobotRecording"], list[str]]:
     """The episodes whose files exist, and one line for each listed episode whose files do not.
 
-    Raises `RecordingError` where `meta/` is broken, and where `views` names a depth map.
+    Raises `RecordingError` where `meta/` is broken.
     """
     meta = read_meta(root, source.limits)
-    if depth := [view for view in meta.info.depth if view in (views or ())]:
-        raise RecordingError(
-            f"{root / MARKER}: data.views asks for {', '.join(depth)}, but is_depth_map is true "
-            "there: a depth map is no picture that the model can be shown. Leave it out of "
-            "data.views"
-        )
-    meta.check_ends()
+    wanted = [key for view, key in meta.info.views.items() if views is None or view in views]
+    meta.check_spans([key for key in wanted if key in meta.info.videos])
     recordings: list[LeRobotRecording] = []
     missing: list[str] = []
     refusal = cache(_refusal)  # many episodes may be in one file
@@ -168,7 +162,6 @@ class LeRobotRecording(Recording):
         described = json.dumps(deciding, sort_keys=True, separators=(",", ":"))
         if (action := self._info.features.get(ACTION)) is not None and action.kind is not None:
             described += f" kind={action.kind}"
-        self._check_spans()
         where, table, time = self._numbers(())
         if not np.array_equal(time, stored_clock(table, where)):
             # Stores of versions before exact clocks hold other times.
@@ -198,27 +191,8 @@ class LeRobotRecording(Recording):
         path = self._sidecar("sensor")
         return None if path is None else _read_sidecar(path, self._overrides.limits)
 
-    def nominal(self) -> Nominal:
-        return Nominal(where=MARKER, mistakes=self._misplaced_rows())
-
-    def _misplaced_rows(self) -> tuple[str, ...]:
-        """A message if `meta/` names another file than the one with the rows."""
-        rows, listed = self._rows.path, self._meta.data(self._entry)
-        if rows == listed:
-            return ()
-        expected, actual = (path.relative_to(self.path).as_posix() for path in (listed, rows))
-        return (
-            f"meta/episodes says that the rows of {self._entry.id} lie in {expected}, they lie in "
-            f"{actual} and were read there; other readers may miss them. Correct its "
-            "data/chunk_index and data/file_index, or convert the data set again with lerobot "
-            "0.5.0 or later (up to 0.4.4 it wrote such entries)",
-        )
-
     def all_views(self) -> Sequence[str]:
         return sorted(self._info.views)
-
-    def depth_views(self) -> Sequence[str]:
-        return sorted(view for view in self._info.depth if self._wants(view))
 
     def _recorded_instruction(self) -> str:
         if self._entry.tasks and len(self._entry.tasks) == 1:
@@ -239,7 +213,6 @@ class LeRobotRecording(Recording):
     def _cameras(self) -> Mapping[str, CameraStream]:
         if not (wanted := self._wanted()):
             return {}
-        self._check_spans()
         _, _, time = self._numbers()
         rows = self._rows
         videos, fps, limits = self._info.videos, self._info.fps, self._overrides.limits
@@ -263,18 +236,6 @@ class LeRobotRecording(Recording):
         where += f", {name!r}"
         values = matrix(table[name], width, where)
         return checked_stream(channels, time, values.astype(np.float32), where)
-
-    def _check_spans(self) -> None:
-        for key in self._wanted().values():
-            rival = self._meta.rivals.get((self._entry.index, key))
-            if rival is not None:
-                span = self._video(key)
-                raise RecordingError(
-                    f"{span.path}: meta/ gives frames of {key!r} from {span.first or 0} on to "
-                    f"{self._entry.id} and to {rival} too, so file_index or from_timestamp of "
-                    "one is wrong. Correct meta/episodes, write the data set again, or leave both "
-                    "episodes or the view out (data.on_bad_episode: skip, data.views)"
-                )
 
     def _numbers(
         self, streams: Sequence[str] = (STATE, ACTION)
@@ -339,7 +300,9 @@ def _read_sidecar(path: Path, limits: MediaLimits) -> Stream:
     if values.ndim != 2:
         raise RecordingError(f"{path}: expected values (N, channel), found {values.shape}")
     names, units = (
-        RECORDINGS.parse([*map(str, members.get(key, ()))], tuple[Text, ...], f"{path}, {key!r}")
+        RECORDINGS.parse(
+            np.atleast_1d(members.get(key, ())).tolist(), tuple[Text, ...], f"{path}, {key!r}"
+        )
         for key in ("names", "units")
     )
     width = values.shape[1]
@@ -353,8 +316,8 @@ def _channels(
     stem: str, width: int, names: tuple[str, ...] | None, units: tuple[str, ...] | None, where: str
 ) -> Channels:
     """Channels with these names and units; without names, the stem and a number."""
-    if width > MOST_CHANNELS:
-        raise META.refusal(where, f"expected at most {MOST_CHANNELS:,} channels, found {width:,}")
+    if width > _MOST_CHANNELS:
+        raise META.refusal(where, f"expected at most {_MOST_CHANNELS:,} channels, found {width:,}")
     names = names or tuple(f"{stem}_{channel}" for channel in range(width))
     units = units or ("",) * width
     if len(names) != width or len(units) != width:

@@ -7,12 +7,12 @@ extensions.
 
 import re
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, reduce
-from itertools import islice, pairwise
+from itertools import pairwise, product
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self, TypeVar
+from typing import Annotated, Any, Literal, Self
 
 from pydantic import AliasChoices, BeforeValidator, Field, JsonValue, Strict, model_validator
 
@@ -24,19 +24,13 @@ from pipeline.data.lerobot_rows import ParquetTable
 from pipeline.data.recording import ActionKind, Grouped, natural_key
 from pipeline.data.video import VideoSpan, frame_count
 
-T = TypeVar("T")
-
 META = Border(
     RecordingError, "Mend meta/, or convert the data set with the lerobot release that wrote it."
 )
 MARKER = "meta/info.json"
 _INFO_BYTES = 8 * 2**20
-_MOST_ROWS = 500_000
-"""Episodes or tasks of a data set; language_table has 440,000 episodes."""
 _ENTRY_COLUMNS = ("episode_index", "length", "tasks", "group")
 _TASK_COLUMNS = ("task_index", "task", "__index_level_0__")
-_OFF_FRAME = 0.1
-"""Fraction of a frame by which a sum of inexact durations may miss the frame's time."""
 _VIEW_PREFIXES = ("observation.images.", "observation.")
 _PLACES = {"v2": "episode_chunk|episode_index", "v3": "chunk_index|file_index"}
 """Placeholders that a path may have, as in `{episode_index:06d}`."""
@@ -103,7 +97,8 @@ class Info(Document):
     """`meta/info.json`."""
 
     codebase_version: Literal["v2.0", "v2.1", "v3.0"]
-    fps: Annotated[float, Field(ge=1e-3, le=1e5)]
+    fps: Annotated[float, Field(ge=1e-3, le=1e3)]
+    """Matroska counts milliseconds, and could not tell frames of a higher rate apart."""
     features: Annotated[dict[Text, Feature], Field(max_length=1000)]
     chunks_size: Annotated[int, Field(ge=1, lt=10**9)]
     data_path: Text
@@ -121,18 +116,10 @@ class Info(Document):
 
     @cached_property
     def views(self) -> dict[str, str]:
-        """Feature keys of the cameras, by view name."""
-        return self._cameras(depth=False)
-
-    @cached_property
-    def depth(self) -> dict[str, str]:
-        """Feature keys of the depth maps, by view name; they are not views."""
-        return self._cameras(depth=True)
-
-    def _cameras(self, depth: bool) -> dict[str, str]:
+        """Feature keys of the cameras, by view name; depth maps are not views."""
         keys: dict[str, str] = {}
         for key, feature in self.features.items():
-            if feature.dtype in ("video", "image") and feature.is_depth_map == depth:
+            if feature.dtype in ("video", "image") and not feature.is_depth_map:
                 view = key.removeprefix(next(filter(key.startswith, _VIEW_PREFIXES), ""))
                 if not is_view_name(view):
                     raise ValueError(f"features: a camera cannot have the name {shown(key)}")
@@ -143,7 +130,7 @@ class Info(Document):
 
     @model_validator(mode="after")
     def _check_names(self) -> Self:
-        _ = self.views, self.depth
+        _ = self.views  # refuses their names
         if self.videos and self.video_path is None:
             raise ValueError("video_path: missing, but features has videos")
         numbers = _PLACES[self.codebase_version[:2]]
@@ -175,40 +162,19 @@ class Span(Place):
 
 
 class Entry(Grouped):
-    """An episode as a line of `meta/episodes.jsonl`; it shares no file."""
+    """An episode as a line of `meta/episodes.jsonl`, or a row of v3.0's `meta/episodes/`."""
 
     index: Index = Field(alias="episode_index")
     length: Index
     tasks: Annotated[tuple[Text, ...], Strict(False)] | None = None
+    data: Place | None = None
+    """Of v3.0, where episodes share files; likewise `videos`."""
+    videos: dict[str, Span] = Field(default_factory=dict[str, Span])
 
     @property
     def id(self) -> str:
         """Such as `episode_000003`."""
         return f"episode_{self.index:06d}"
-
-    def place(self, chunks_size: int, key: str | None = None) -> dict[str, int]:
-        """The numbers in the path of its rows, or of its video of feature `key`."""
-        return {"episode_index": self.index, "episode_chunk": self.index // chunks_size}
-
-    def frames(self, key: str, fps: float) -> tuple[int | None, int | None]:
-        """The number of its first frame in the video of a feature, and the count; None: all."""
-        return None, None
-
-
-class SharedEntry(Entry):
-    """An episode as a row of v3.0's `meta/episodes/`: it shares its files with others."""
-
-    data: Place
-    videos: dict[str, Span]
-
-    def place(self, chunks_size: int, key: str | None = None) -> dict[str, int]:
-        place = self.data if key is None else self.videos[key]
-        return {"chunk_index": place.chunk_index, "file_index": place.file_index}
-
-    def frames(self, key: str, fps: float) -> tuple[int | None, int | None]:
-        # Rounded, because the timestamps are inexact sums such as 36.900000000000006.
-        begin, end = self.videos[key].from_timestamp, self.videos[key].to_timestamp
-        return round(begin * fps), round((end - begin) * fps)
 
 
 class Task(Document):
@@ -233,50 +199,47 @@ class LeRobotMeta:
 
     def data(self, entry: Entry) -> Path:
         """The file of an episode's rows, as `meta/` says."""
-        return self.root / self.info.data_path.format(**entry.place(self.info.chunks_size))
+        return self.root / self.info.data_path.format(**self._numbers(entry, entry.data))
 
     def video(self, entry: Entry, key: str) -> VideoSpan:
         """An episode's frames of the video of a feature."""
-        place = entry.place(self.info.chunks_size, key)
-        path = (self.info.video_path or "").format(video_key=key, **place)
-        return VideoSpan(self.root / path, *entry.frames(key, self.info.fps))
+        span, fps = entry.videos.get(key), self.info.fps
+        numbers = self._numbers(entry, span)
+        path = self.root / (self.info.video_path or "").format(video_key=key, **numbers)
+        if span is None:
+            return VideoSpan(path)
+        # Rounded, because the timestamps are inexact sums such as 36.900000000000006.
+        count = round((span.to_timestamp - span.from_timestamp) * fps)
+        return VideoSpan(path, round(span.from_timestamp * fps), count)
 
-    def check_ends(self) -> None:
-        """Raise `RecordingError` where a video is too short and no episode begins at its start.
+    def _numbers(self, entry: Entry, place: Place | None) -> dict[str, int]:
+        """The numbers in a path."""
+        own = {"episode_index": entry.index, "episode_chunk": entry.index // self.info.chunks_size}
+        return own | (place.model_dump() if place else {})
 
-        Its episodes would then get frames of others. A video whose first episode begins at frame 0
-        may be truncated, and one that reaches its last episode's end may belong to a trimmed copy:
-        both pass.
+    def check_spans(self, keys: Collection[str]) -> None:
+        """Raise `RecordingError` where `meta/` gives an episode frames of another in these videos.
+
+        That is so where two episodes share a frame, and where a video is too short and no episode
+        begins at its start. A video whose first episode begins at frame 0 may be truncated, and one
+        that reaches its last episode's end may belong to a trimmed copy: both pass.
         """
-        for path, spans in self._spans.items():
-            first, stop = spans[0][0], spans[-1][0] + spans[-1][3].length
+        place = self.root / "meta" / "episodes"
+        spans: dict[Path, list[tuple[int, int, str]]] = defaultdict(list)
+        for entry, key in product(self.entries, keys):
+            span = self.video(entry, key)
+            first = span.first or 0
+            spans[span.path].append((first, first + entry.length, entry.id))
+        for path, of_file in spans.items():
+            of_file.sort()
+            for (_, stop, before), (first, _, after) in pairwise(of_file):
+                if first < stop:
+                    why = f"{before} and {after} have the same frames of {path}: file_index or "
+                    raise META.refusal(place, f"{why}from_timestamp of one is wrong")
+            first, stop = of_file[0][0], of_file[-1][1]
             if first and 0 < (frames := frame_count(path, self.limits)) < stop:
                 why = f"expected from_timestamp and length for frames 0 to {frames - 1} of {path}, "
-                why += f"found {first} to {stop - 1}"
-                raise META.refusal(self.root / "meta" / "episodes", why)
-
-    @cached_property
-    def _spans(self) -> Mapping[Path, list[tuple[int, int, str, Entry]]]:
-        """For each video, in order: (first frame, index, feature key, episode)."""
-        spans: dict[Path, list[tuple[int, int, str, Entry]]] = defaultdict(list)
-        for entry in self.entries:
-            for key in self.info.videos:
-                span = self.video(entry, key)
-                spans[span.path].append((span.first or 0, entry.index, key, entry))
-        return {path: sorted(of_file, key=lambda span: span[:3]) for path, of_file in spans.items()}
-
-    @cached_property
-    def rivals(self) -> Mapping[tuple[int, str], str]:
-        """(episode index, feature key) -> another episode that shares some of its frames."""
-        rivals: dict[tuple[int, str], str] = {}
-        for spans in self._spans.values():
-            until, last = 0, ("", spans[0][-1])
-            for first, index, key, entry in spans:
-                if first < until:
-                    rivals[index, key], rivals[last[1].index, last[0]] = last[1].id, entry.id
-                if first + entry.length > until:
-                    until, last = first + entry.length, (key, entry)
-        return rivals
+                raise META.refusal(place, f"{why}found {first} to {stop - 1}")
 
 
 def read_meta(root: Path, limits: MediaLimits) -> LeRobotMeta:
@@ -288,7 +251,7 @@ def read_meta(root: Path, limits: MediaLimits) -> LeRobotMeta:
     info = META.read_json(root / MARKER, Info, _INFO_BYTES)
     path = root / "meta" / ("episodes" if info.shared else "episodes.jsonl")
     rows = _shared_entries(path, info, limits) if info.shared else META.read_json_lines(path, Entry)
-    entries = sorted(_bounded(rows, root), key=lambda entry: entry.index)
+    entries = sorted(rows, key=lambda entry: entry.index)
     for before, entry in pairwise(entries):
         if before.index == entry.index:
             raise META.refusal(path, f"expected each episode once, found {entry.id} twice")
@@ -303,20 +266,13 @@ def _shared_entries(folder: Path, info: Info, limits: MediaLimits) -> Iterator[E
     columns += [f"videos/{key}/{name}" for key in info.videos for name in Span.model_fields]
     for path in files:
         for where, cells in ParquetTable(path, limits).rows(columns):
-            row: dict[str, Any] = {"videos": {key: {} for key in info.videos}}
+            row: dict[str, Any] = {"data": {}, "videos": {key: {} for key in info.videos}}
             for column, cell in cells.items():
                 *parents, name = column.split("/")  # no key contains a slash
                 reduce(lambda inner, parent: inner.setdefault(parent, {}), parents, row)[name] = (
                     cell
                 )
-            entry = META.parse(row, SharedEntry, where)
-            for key, span in entry.videos.items():
-                frame = span.from_timestamp * info.fps
-                if abs(frame - round(frame)) > _OFF_FRAME:
-                    why = f"videos/{key}/from_timestamp: expected the time of a frame at fps "
-                    why += f"{info.fps:g}, found {span.from_timestamp:.6g} s, frame {frame:.2f}"
-                    raise META.refusal(where, why)
-            yield entry
+            yield META.parse(row, Entry, where)
 
 
 def _task_text(root: Path, shared: bool, limits: MediaLimits) -> dict[int, str]:
@@ -330,16 +286,7 @@ def _task_text(root: Path, shared: bool, limits: MediaLimits) -> dict[int, str]:
     else:
         tasks = META.read_json_lines(path, Task)
     texts: dict[int, str] = {}
-    for task in _bounded(tasks, root):
+    for task in tasks:
         if texts.setdefault(task.index, task.text) != task.text:
             raise META.refusal(path, f"expected each task once, found {task.index} twice")
     return texts
-
-
-def _bounded(rows: Iterable[T], root: Path) -> list[T]:
-    """These rows of `meta/`; refused where there are more than in any known data set."""
-    some = list(islice(rows, _MOST_ROWS + 1))
-    if len(some) > _MOST_ROWS:
-        why = f"expected at most {_MOST_ROWS:,} episodes or tasks, found more"
-        raise RecordingError(f"{root / 'meta'}: {why}. Split the data set")
-    return some

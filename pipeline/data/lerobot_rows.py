@@ -19,9 +19,9 @@ from numpy.typing import NDArray
 from pipeline.base.border import shown
 from pipeline.base.config import MediaLimits
 from pipeline.base.errors import RecordingError
+from pipeline.data.arrays import matrix
 from pipeline.data.jpeg import check_image, read_image
 from pipeline.data.recording import (
-    INTACT,
     RECORDINGS,
     CameraStream,
     check_clock,
@@ -37,9 +37,6 @@ _SAME_S = 1e-9
 _ROUNDINGS = 2
 """Most steps of the stored type between a time and its frame number's time: the writer may have
 multiplied by a rounded 1 / fps."""
-_LATEST_S = 1e12
-"""A clock in nanoseconds passes it after a quarter of an hour; one in seconds never does."""
-_UNITS = {"milliseconds": 1e3, "microseconds": 1e6, "nanoseconds": 1e9}
 _WIDEST = 8
 """Most bytes of one number, or of the offset of a text."""
 _BATCH_BYTES = 64 * 2**20
@@ -72,7 +69,7 @@ class ParquetTable:
         names = file.schema_arrow.names
         present = [name for name in wanted if name in names]
         if twice := [name for name in present if names.count(name) > 1]:
-            raise INTACT.refusal(self.path, f"expected one column {twice[0]!r}, found more")
+            raise RECORDINGS.refusal(self.path, f"expected one column {twice[0]!r}, found more")
         # Arrow reads all leaves whose path begins with the column's name.
         begins = tuple(f"{name}." for name in present)
         schema = file.schema
@@ -83,7 +80,7 @@ class ParquetTable:
             for leaf in map(rows.column, leaves):
                 pages += max(0, leaf.total_uncompressed_size)
                 unpacked += max(0, leaf.total_uncompressed_size, leaf.num_values * _WIDEST)
-        check_unpacked(self.path, unpacked, self.path.stat().st_size, self.limits)
+        check_unpacked(self.path, unpacked, self.limits)
         return present, pages
 
     def rows(self, wanted: Sequence[str]) -> Iterator[tuple[str, dict[str, Any]]]:
@@ -98,45 +95,17 @@ class ParquetTable:
                     yield f"{self.path}, row {number}", row
                     number += 1
 
-    def numbers(self, wanted: Sequence[str], groups: Sequence[int] | None = None) -> pa.Table:
-        """Those wanted columns that the file has, with numbers or lists of numbers.
-
-        Reads these row groups; all of them where `groups` is None.
-        """
-        return _read_numbers(self, self._stamp(), tuple(wanted), groups and tuple(groups))
-
-    def groups(self, start: int, stop: int) -> tuple[range, int]:
-        """The row groups that hold these rows, and the first row of the first group."""
-        counts = _row_counts(self, self._stamp())
-        if sum(counts) < stop or min(counts) < 0:
-            why = f"expected {stop} rows, found {sum(counts)} in its row groups"
-            raise RECORDINGS.refusal(self.path, why)
-        ends = np.cumsum(counts, dtype=np.int64)
-        first = int(np.searchsorted(ends, start, side="right"))
-        last = int(np.searchsorted(ends, stop, side="left"))
-        return range(first, last + 1), int(ends[first] - counts[first])
-
-    def _stamp(self) -> int:
-        """A number that changes with the file."""
+    def numbers(self, wanted: Sequence[str]) -> pa.Table:
+        """Those wanted columns that the file has, with numbers or lists of numbers."""
         RECORDINGS.check_file(self.path)
-        return self.path.stat().st_mtime_ns
+        return _read_numbers(self, self.path.stat().st_mtime_ns, tuple(wanted))
 
 
+# Cached, because hundreds of episodes, read in order, can share a file.
 @lru_cache(maxsize=4)
-def _row_counts(table: ParquetTable, stamp: int) -> list[int]:
-    """Rows of each row group."""
+def _read_numbers(table: ParquetTable, changed_ns: int, wanted: tuple[str, ...]) -> pa.Table:
     with table.open() as file:
-        return [file.metadata.row_group(place).num_rows for place in range(file.num_row_groups)]
-
-
-# Cached, because hundreds of episodes, read in order, can share a file or even a row group.
-@lru_cache(maxsize=4)
-def _read_numbers(
-    table: ParquetTable, stamp: int, wanted: tuple[str, ...], groups: tuple[int, ...] | None
-) -> pa.Table:
-    with table.open() as file:
-        groups = tuple(range(file.num_row_groups)) if groups is None else groups
-        present, _ = table.check(file, wanted, groups)
+        present, _ = table.check(file, wanted, range(file.num_row_groups))
         schema = file.schema_arrow
         for name in present:
             kind = number = schema.field(name).type
@@ -145,7 +114,7 @@ def _read_numbers(
             if not (pa.types.is_floating(number) or pa.types.is_integer(number)):
                 where = f"{table.path}, column {name!r}"
                 raise RECORDINGS.refusal(where, f"expected numbers, found {shown(str(kind))}")
-        return file.read_row_groups(list(groups), columns=present)
+        return file.read(columns=present)
 
 
 @dataclass(frozen=True)
@@ -163,19 +132,19 @@ class ParquetRows:
 
     def columns(self, wanted: Sequence[str]) -> pa.Table:
         """Those wanted columns that the file has, each (row,), with numbers or lists of numbers."""
-        groups, offset = self.table.groups(self.start, self.stop)
-        rows = self.table.numbers(wanted, groups).slice(self.start - offset, self.stop - self.start)
-        if rows.num_columns and rows.num_rows != self.stop - self.start:
-            why = f"expected {self.stop - self.start} rows as it declares, found {rows.num_rows}"
-            raise RECORDINGS.refusal(self.path, why)
-        return rows
+        return self.table.numbers(wanted).slice(self.start, self.stop - self.start)
 
     def images(self, column: str, rows: Sequence[int]) -> Iterator[tuple[int, bytes]]:
         """The encoded image of each of these rows (ascending, none twice), one row at a time."""
-        groups, offset = self.table.groups(self.start, self.stop)
         where = f"{self.path}, column {column!r}"
         missing = set(rows)
         with self.table.open() as file:
+            places = range(file.num_row_groups)
+            counts = np.array([file.metadata.row_group(place).num_rows for place in places])
+            ends = np.cumsum(counts)
+            first = int(np.searchsorted(ends, self.start, side="right"))
+            groups = places[first : int(np.searchsorted(ends, self.stop)) + 1]
+            offset = int(ends[first] - counts[first])
             present, _ = self.table.check(file, [column], groups)
             kind = file.schema_arrow.field(column).type if present else pa.null()
             if not isinstance(kind, pa.StructType) or kind.get_field_index("bytes") < 0:
@@ -226,8 +195,6 @@ class ParquetCamera(CameraStream):
             )
         where = f"{rows.path}, the times of the images of {view!r}"
         check_clock(own, where)
-        if captured is not None:  # one image may be in many rows, so times repeat
-            check_resolution(time.astype(captured.dtype), where)
         if (late := np.flatnonzero(own > time + _SAME_S)).size:
             row = int(late[0])
             raise RecordingError(
@@ -261,42 +228,14 @@ class ParquetCamera(CameraStream):
         return f"{self._rows.path}, column {self._column!r}, row {self._rows.start + row}"
 
 
-def matrix(column: pa.ChunkedArray, width: int, where: str) -> NDArray[np.float64]:
-    """A column of vectors, or of numbers if the width is 1, as (row, width)."""
-    array = column.combine_chunks()
-    if array.null_count:
-        raise RECORDINGS.refusal(where, f"no value in row {int(np.argmax(array.is_null()))}")
-    if isinstance(array, pa.ListArray | pa.LargeListArray | pa.FixedSizeListArray):
-        fixed = isinstance(array, pa.FixedSizeListArray)
-        lengths = np.array([array.type.list_size]) if fixed else _numbers(array.value_lengths())
-        if (lengths != width).any():
-            row = int(np.argmax(lengths != width))
-            why = f"{lengths[row]} values in row {row}, but its feature has {width}"
-            raise RECORDINGS.refusal(where, why)
-        array = array.flatten()
-    values = _numbers(array)
-    if values.size != len(column) * width:
-        raise RECORDINGS.refusal(where, f"one number a row, but its feature has {width}")
-    return values.astype(np.float64).reshape(len(column), width)
-
-
-def _numbers(array: pa.Array) -> NDArray[Any]:
-    """An array of numbers, NaN for a null; not with `to_numpy`, which would import pandas."""
-    if array.null_count:
-        array = array.cast(pa.float64()).fill_null(np.nan)
-    dtype = np.dtype(array.type.to_pandas_dtype())
-    return np.frombuffer(array.buffers()[1], dtype, len(array), array.offset * dtype.itemsize)
-
-
 def read_clock(table: pa.Table, fps: float, where: str) -> NDArray[np.float64]:
     """(row,) s, rising; from frame numbers and `fps` if these agree with the stored times.
 
-    Raises `RecordingError` where the clock does not rise or is not in seconds.
+    Raises `RecordingError` where the clock does not rise.
     """
     stored = stored_clock(table, where)
     check_clock(stored, f"{where}, {CLOCK!r}")
     check_resolution(stored.astype(_stored_type(table)), f"{where}, {CLOCK!r}")
-    _check_seconds(stored, fps, where)
     time = _exact(stored, _stored_type(table), _frames(table, where), fps)
     # Rows are chosen by time: of two rows at one time, the earlier would get the later's frame.
     check_clock(time, f"{where}, {CLOCK!r}", rising=True)
@@ -307,12 +246,7 @@ def stored_clock(table: pa.Table, where: str) -> NDArray[np.float64]:
     """(row,) s, the column `timestamp` as stored."""
     if CLOCK not in table.column_names:
         raise RECORDINGS.refusal(where, f"missing column {CLOCK!r}")
-    where += f", {CLOCK!r}"
-    stored = matrix(table[CLOCK], 1, where)[:, 0]
-    if (far := np.flatnonzero(np.abs(stored) > _LATEST_S)).size:
-        why = f"expected seconds, found {stored[far[0]]:g} in row {far[0]}"
-        raise RECORDINGS.refusal(where, why)
-    return stored
+    return matrix(table[CLOCK], 1, f"{where}, {CLOCK!r}")[:, 0]
 
 
 def check_frames(table: pa.Table, rows: ParquetRows) -> None:
@@ -362,14 +296,3 @@ def _exact(
         if (np.abs(time - stored) <= allowed).all():
             return time
     return stored
-
-
-def _check_seconds(time: NDArray[np.float64], fps: float, where: str) -> None:
-    step = float(np.median(np.diff(time))) if len(time) > 1 else 0.0
-    for unit, factor in _UNITS.items():
-        if 0.5 < step * fps / factor < 2:
-            raise RecordingError(
-                f"{where}, {CLOCK!r}: expected rows {1 / fps:.3g} s apart by fps {fps:g} of "
-                f"meta/info.json, found {step:g}: these are {unit}. Divide the column by "
-                f"{factor:g}, or correct fps"
-            )

@@ -1,16 +1,14 @@
-"""Writes LeRobot data sets, and this project's sidecars beside them, for its own reader.
+"""Writes LeRobot data sets v3.0, and this project's sidecars beside them, for its own reader.
 
-`write_v21` and `write_filmed_v30` write many episodes, with one video per view and episode;
-`write_v30` writes one episode, with the encoded images unchanged in its rows. `meta/info.json` is
-written last: until then the folder does not look like a recording. `units` and `kind` of a feature
-are this project's extension; other readers ignore them.
+`meta/info.json` is written last: until then the folder does not look like a recording. `units` and
+`kind` of a feature are this project's extension; other readers ignore them.
 """
 
 import json
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, Final, Literal, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import av
 import numpy as np
@@ -25,77 +23,36 @@ Columns = Mapping[str, NDArray[Any]]
 Features = Mapping[str, Mapping[str, Any]]
 """Feature key -> its entries in `info.json` besides type and shape."""
 
-_DATA: Final = {
-    "v2.1": "data/chunk-{episode_chunk:03d}/episode_{episode_index:06d}.parquet",
-    "v3.0": "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet",
-}
-_VIDEO: Final = {
-    "v2.1": "videos/chunk-{episode_chunk:03d}/{video_key}/episode_{episode_index:06d}.mp4",
-    "v3.0": "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4",
-}
+_DATA: Final = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
+_VIDEO: Final = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"
 _CHUNK: Final = 1000
 """Files in a folder."""
 _NUMBERING: Final = ("timestamp", "frame_index", "episode_index", "index", "task_index")
-_STATISTICS_EVERY: Final = 10
-"""Image statistics use every tenth frame."""
 _IMAGES_A_GROUP: Final = 64
 """Images in a row group: equal images are stored once per group, and a group is held in memory."""
 _DICTIONARY_BYTES: Final = 2**30
-_FIRST: Final = {"chunk_index": 0, "file_index": 0}
 _IMAGE: Final = pa.struct(
     [("bytes", pa.dictionary(pa.int32(), pa.binary())), ("path", pa.string())]
 )
 
 
-class FilmedRows(NamedTuple):
-    """The rows of one episode, and for each feature key its frames (row, height, width, 3) RGB."""
+class LeRobotEpisode(NamedTuple):
+    """The rows of one episode and, by feature key, the frames of each camera."""
 
     columns: Columns
-    frames: Mapping[str, NDArray[np.uint8]]
+    films: Mapping[str, NDArray[np.uint8]] = {}
+    """(row, height, width, 3) RGB, written as a video."""
+    images: Mapping[str, Sequence[Path]] = {}
+    """Each row's image file, written unchanged into the rows."""
 
 
-def write_v21(
+def write_data_set(
     root: Path,
-    episodes: Iterable[FilmedRows],
+    episodes: Iterable[LeRobotEpisode],
     features: Features,
     task: str,
-    fps: int,
-    robot_type: str,
-) -> None:
-    """Write a complete data set; reads one episode at a time from the iterable."""
-    lengths: list[int] = []
-    statistics: list[dict[str, Any]] = []
-    described: dict[str, dict[str, Any]] = {}
-    for index, (own, frames) in enumerate(episodes):
-        columns = _numbered(own, index, sum(lengths))
-        place = {"episode_chunk": 0, "episode_index": index}
-        _write_filmed(root, "v2.1", place, FilmedRows(columns, frames), fps)
-        lengths.append(len(columns["timestamp"]))
-        statistics.append(_statistics(columns, frames))
-        cameras = {key: _video_feature(film, fps) for key, film in frames.items()}
-        described = _described(columns, cameras, features)
-    (root / "meta").mkdir()
-    for name, rows in {
-        "tasks": [{"task_index": 0, "task": task}],
-        "episodes": [
-            {"episode_index": i, "tasks": [task], "length": n} for i, n in enumerate(lengths)
-        ],
-        "episodes_stats": [{"episode_index": i, "stats": s} for i, s in enumerate(statistics)],
-    }.items():
-        lines = "".join(json.dumps(row) + "\n" for row in rows)
-        (root / "meta" / f"{name}.jsonl").write_text(lines, encoding="utf-8")
-    videos = sum(feature["dtype"] == "video" for feature in described.values())
-    totals = {"total_videos": len(lengths) * videos, "total_chunks": 1}
-    _write_info(root, "v2.1", lengths, described, fps, robot_type, **totals)
-
-
-def write_filmed_v30(
-    root: Path,
-    episodes: Iterable[FilmedRows],
-    features: Features,
-    task: str,
-    fps: int,
-    robot_type: str,
+    fps: float,
+    robot_type: str | None = None,
 ) -> None:
     """Write a complete data set; reads one episode at a time from the iterable.
 
@@ -103,64 +60,44 @@ def write_filmed_v30(
     """
     rows: list[dict[str, Any]] = []
     described: dict[str, dict[str, Any]] = {}
-    for index, (own, frames) in enumerate(episodes):
+    for index, (own, films, images) in enumerate(episodes):
         first = rows[-1]["dataset_to_index"] if rows else 0
         columns = _numbered(own, index, first)
         length = len(columns["timestamp"])
         place = {"chunk_index": index // _CHUNK, "file_index": index % _CHUNK}
-        _write_filmed(root, "v3.0", place, FilmedRows(columns, frames), fps)
-        spans: dict[str, float] = {f"data/{name}": number for name, number in place.items()}
-        for key in frames:
+        _write_rows(root / _DATA.format(**place), columns, images)
+        row = {"episode_index": index, "length": length, "tasks": [task]}
+        row |= {"dataset_from_index": first, "dataset_to_index": first + length}
+        row |= {f"data/{name}": number for name, number in place.items()}
+        row |= {"meta/episodes/chunk_index": 0, "meta/episodes/file_index": 0}
+        for key, film in films.items():
+            _write_video(root / _VIDEO.format(video_key=key, **place), film, round(fps))
             span = {**place, "from_timestamp": 0.0, "to_timestamp": length / fps}
-            spans |= {f"videos/{key}/{name}": value for name, value in span.items()}
-        rows.append(_shared_row(index, first, length, task) | spans)
-        cameras = {key: _video_feature(film, fps) for key, film in frames.items()}
+            row |= {f"videos/{key}/{name}": value for name, value in span.items()}
+        rows.append(row)
+        cameras = {key: _video_feature(film) for key, film in films.items()} | {
+            key: {"dtype": "image", "names": ["height", "width", "channel"]} for key in images
+        }
         described = _described(columns, cameras, features)
-    _write_shared_meta(root, rows, task)
-    _write_info(root, "v3.0", [row["length"] for row in rows], described, fps, robot_type)
+    _write_meta(root, rows, task)
+    info = {
+        "codebase_version": "v3.0",
+        "robot_type": robot_type,
+        "total_episodes": len(rows),
+        "total_frames": rows[-1]["dataset_to_index"],
+        "total_tasks": 1,
+        "chunks_size": _CHUNK,
+        "fps": int(fps) if float(fps).is_integer() else fps,
+        "splits": {"train": f"0:{len(rows)}"},
+        "data_path": _DATA,
+        "video_path": _VIDEO if any(f["dtype"] == "video" for f in described.values()) else None,
+        "features": described,
+    }
+    (root / MARKER).write_text(json.dumps(info, indent=4), encoding="utf-8")
 
 
-def _write_filmed(
-    root: Path, version: str, place: Mapping[str, int], episode: FilmedRows, fps: int
-) -> None:
-    """Write the files of one episode: its numbered columns, and a video a view."""
-    data = root / _DATA[version].format(**place)
-    data.parent.mkdir(parents=True, exist_ok=True)
-    pq.write_table(_number_table(episode.columns), data)
-    for key, film in episode.frames.items():
-        _write_video(root / _VIDEO[version].format(video_key=key, **place), film, fps)
-
-
-def write_v30(
-    root: Path,
-    columns: Columns,
-    images: Mapping[str, Sequence[Path]],
-    features: Features,
-    task: str,
-    fps: float,
-) -> None:
-    """Write a data set of one episode; `images` has each row's image file by feature key.
-
-    The parquet file's dictionary stores equal images once, so that rows between two frames cost
-    almost nothing.
-    """
-    columns = _numbered(columns, 0, 0)
-    _write_rows(root / _DATA["v3.0"].format(**_FIRST), columns, images)
-    rows = len(columns["timestamp"])
-    _write_shared_meta(root, [_shared_row(0, 0, rows, task)], task)
-    cameras = {key: {"dtype": "image", "names": ["height", "width", "channel"]} for key in images}
-    _write_info(root, "v3.0", [rows], _described(columns, cameras, features), fps)
-
-
-def _shared_row(index: int, first: int, length: int, task: str) -> dict[str, Any]:
-    """An episode's row of v3.0's `meta/episodes`, with its data in the first file."""
-    places = [f"{kind}/{name}" for kind in ("data", "meta/episodes") for name in _FIRST]
-    counts = {"episode_index": index, **dict.fromkeys(places, 0), "length": length, "tasks": [task]}
-    return counts | {"dataset_from_index": first, "dataset_to_index": first + length}
-
-
-def _write_shared_meta(root: Path, rows: list[dict[str, Any]], task: str) -> None:
-    """Write `meta/episodes` and `meta/tasks.parquet` of v3.0."""
+def _write_meta(root: Path, rows: list[dict[str, Any]], task: str) -> None:
+    """Write `meta/episodes` and `meta/tasks.parquet`."""
     folder = root / "meta" / "episodes" / "chunk-000"
     folder.mkdir(parents=True)
     pq.write_table(pa.Table.from_pylist(rows), folder / "file-000.parquet")
@@ -206,34 +143,6 @@ def _described(columns: Columns, cameras: Features, features: Features) -> dict[
     return {name: {**{**numbers, **cameras}[name], **features.get(name, {})} for name in order}
 
 
-def _write_info(
-    root: Path,
-    version: Literal["v2.1", "v3.0"],
-    lengths: Sequence[int],
-    features: Features,
-    fps: float,
-    robot_type: str | None = None,
-    **totals: int,
-) -> None:
-    info = {
-        "codebase_version": version,
-        "robot_type": robot_type,
-        "total_episodes": len(lengths),
-        "total_frames": sum(lengths),
-        "total_tasks": 1,
-        **totals,
-        "chunks_size": _CHUNK,
-        "fps": int(fps) if float(fps).is_integer() else fps,
-        "splits": {"train": f"0:{len(lengths)}"},
-        "data_path": _DATA[version],
-        "video_path": _VIDEO[version]
-        if any(f["dtype"] == "video" for f in features.values())
-        else None,
-        "features": features,
-    }
-    (root / MARKER).write_text(json.dumps(info, indent=4), encoding="utf-8")
-
-
 def _number_table(columns: Columns) -> pa.Table:
     arrays = {
         name: pa.array(values)
@@ -257,47 +166,13 @@ def _write_video(path: Path, frames: NDArray[np.uint8], fps: int) -> None:
         container.mux(stream.encode())
 
 
-def _video_feature(frames: NDArray[np.uint8], fps: int) -> dict[str, Any]:
-    _, height, width, channels = frames.shape
-    info = {
-        "video.height": height,
-        "video.width": width,
-        "video.codec": "h264",
-        "video.pix_fmt": "yuv420p",
-        "video.is_depth_map": False,
-        "video.fps": fps,
-        "video.channels": channels,
-        "has_audio": False,
-    }
-    names, shape = ["height", "width", "channel"], [height, width, channels]
-    return {"dtype": "video", "shape": shape, "names": names, "info": info}
-
-
-def _statistics(columns: Columns, frames: Mapping[str, NDArray[np.uint8]]) -> dict[str, Any]:
-    """LeRobot's statistics of an episode; images in 0..1, one value per colour, (3, 1, 1)."""
-    stats: dict[str, Any] = {
-        name: {**_of(values.reshape(len(values), -1)), "count": [len(values)]}
-        for name, values in columns.items()
-    }
-    for key, film in frames.items():
-        some = film[::_STATISTICS_EVERY]
-        colours = _of(some.reshape(-1, 3) / 255)
-        stats[key] = {name: np.reshape(colours[name], (3, 1, 1)).tolist() for name in colours}
-        stats[key]["count"] = [len(some)]
-    return stats
-
-
-def _of(rows: NDArray[Any]) -> dict[str, list[Any]]:
-    return {
-        "min": rows.min(0).tolist(),
-        "max": rows.max(0).tolist(),
-        "mean": rows.mean(0, dtype=np.float64).tolist(),
-        "std": rows.std(0, dtype=np.float64).tolist(),
-    }
+def _video_feature(frames: NDArray[np.uint8]) -> dict[str, Any]:
+    shape = [*frames.shape[1:]]
+    return {"dtype": "video", "shape": shape, "names": ["height", "width", "channel"]}
 
 
 def _write_rows(path: Path, columns: Columns, images: Mapping[str, Sequence[Path]]) -> None:
-    path.parent.mkdir(parents=True)
+    path.parent.mkdir(parents=True, exist_ok=True)
     table = _number_table(columns)
     schema = pa.schema([*table.schema, *(pa.field(key, _IMAGE) for key in images)])
     changes = np.zeros(table.num_rows)

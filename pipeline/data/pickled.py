@@ -16,7 +16,7 @@ from pathlib import Path, PurePath, PurePosixPath, PureWindowsPath
 from typing import Annotated, Any
 
 import numpy as np
-from pydantic import AfterValidator, BeforeValidator, Field, InstanceOf, Strict
+from pydantic import AfterValidator, BeforeValidator, InstanceOf, Strict
 
 from pipeline.base.border import Document, Text, shown
 from pipeline.base.config import Source
@@ -26,17 +26,14 @@ from pipeline.data.arrays import Numbers, numeric, read_npy
 from pipeline.data.insertion import (
     SENSOR,
     InsertionRecording,
-    promised,
     read_robot_states,
     robot_state_file,
     sensor_rows,
 )
 from pipeline.data.jpeg import frame_time, name_views, split_eye
 from pipeline.data.recording import (
-    INTACT,
     RECORDINGS,
     Channels,
-    Nominal,
     Rate,
     RecordedAction,
     Stream,
@@ -58,8 +55,6 @@ _PickledArray = Annotated[InstanceOf[np.ndarray], AfterValidator(np.asarray)]
 class _Metadata(Document):
     action_hz: Rate | None = None
     robot_hz: Rate | None = None
-    has_sensor: bool | None = None
-    num_robot_states: int | None = Field(default=None, ge=0, le=10**9)
 
 
 class _Readings(Document):
@@ -96,8 +91,6 @@ class PickledRecording(InsertionRecording):
         super().__init__(path, source, views)
         self._pickle = path / MARKER
         self._kept: _Content | None = None
-        self._located: dict[str, str] = {}
-        """Recorded folder -> the folder in which its frames are now."""
 
     def action(self) -> RecordedAction:
         content = self._content()
@@ -129,12 +122,6 @@ class PickledRecording(InsertionRecording):
             return None
         rate_hz = self._content().metadata.robot_hz or _ROBOT_HZ
         return read_robot_states(path, self._overrides.limits, self._start, rate_hz)
-
-    def nominal(self) -> Nominal:
-        """The streams that the pickle's metadata list; the clocks are made from its rates."""
-        metadata = self._content().metadata
-        streams = promised(metadata, sensor=("has_sensor",), state=("num_robot_states",))
-        return Nominal(streams, where=f"{MARKER}'s metadata")
 
     def _content(self) -> _Content:
         """The pickle's content, possibly without the sensor's readings."""
@@ -180,17 +167,12 @@ class PickledRecording(InsertionRecording):
 
     def _locate(self, recorded: str, where: str) -> Path:
         """The file at its recorded path, or at the longest tail of it under this folder."""
-        at = max(recorded.rfind("/"), recorded.rfind("\\")) + 1
-        known = self._located.get(recorded[:at])
-        if known is not None and os.path.isfile(place := f"{known}/{recorded[at:]}"):  # noqa: PTH113
-            return Path(place)
         # Only the last parts of the path can exist under the episode's folder.
         parts = _pure(recorded).parts[-10:]
         for tail in (Path(recorded), *(Path(*parts[first:]) for first in range(len(parts)))):
             candidate = self.path / tail  # the tail itself if it is absolute
             inside = tail.is_absolute() or ".." not in tail.parts
             if inside and os.path.isfile(candidate):  # noqa: PTH113, a name may be too long
-                self._located[recorded[:at]] = str(candidate.parent)
                 return candidate
         raise RecordingError(
             f"{where}: {recorded} is not there, nor is any tail of it under {self.path}; "
@@ -249,32 +231,21 @@ def _frombuffer(data: Any, dtype: _Dtype, shape: Any, order: str, axes: Any = No
     return array if axes is None else array.transpose(axes)
 
 
-def _latin1(text: str, encoding: str) -> bytes:
-    """Bytes as protocol 2 writes them."""
-    if encoding != "latin1":
-        raise _Refused(f"encoding {shown(encoding)}")
-    return text.encode("latin1")
-
-
 _CALLS: dict[str, Callable[..., Any]] = {
     "numpy.dtype": _Dtype,
     "numpy._core.multiarray._reconstruct": lambda *_: np.empty(0, np.int8).view(_Array),
     "numpy._core.multiarray.scalar": lambda dtype, data: np.frombuffer(data, dtype.dtype)[0].item(),
     "numpy._core.numeric._frombuffer": _frombuffer,
-    "_codecs.encode": _latin1,
     "collections.OrderedDict": dict,
     "builtins.set": set,
     "builtins.frozenset": frozenset,
-    "builtins.bytes": lambda: b"",
 }
 """The functions that replace the names in a pickle."""
 
 
 class _Unpickler(pickle.Unpickler):
     def find_class(self, module: str, name: str, /) -> Any:
-        # The spelling of numpy 2 and protocol 3.
-        known = f"{module}.{name}".replace("numpy.core.", "numpy._core.")
-        known = known.replace("__builtin__.", "builtins.")
+        known = f"{module}.{name}".replace("numpy.core.", "numpy._core.")  # numpy 1
         if known == "numpy.ndarray":  # an argument of _reconstruct, never called
             return None
         if known not in _CALLS:
@@ -287,7 +258,8 @@ def load_plain(path: Path, most: int) -> Any:
     """The content of a pickle of numpy arrays, scalars, dicts, lists, tuples, sets and text.
 
     Numpy scalars become plain numbers. Raises `RecordingError`, and executes nothing, where the
-    pickle asks for anything else, is damaged, or has more than `most` bytes.
+    pickle asks for anything else (as protocols below 3 do), is damaged, or has more than `most`
+    bytes.
     """
     check_limit(path, RECORDINGS.check_file(path), most, "array_bytes", "bytes")
     # Damaged bytes make numpy and the unpickler raise almost any exception.
@@ -295,7 +267,7 @@ def load_plain(path: Path, most: int) -> Any:
         try:
             return _Unpickler(file, encoding="latin1").load()
         except _Refused as error:
-            raise INTACT.refusal(
+            raise RECORDINGS.refusal(
                 path,
                 f"refused: it asks for {error}; only numpy arrays and plain containers are "
                 "admitted, because a pickle can run code. Nothing was executed",

@@ -3,7 +3,6 @@
 `robot_state_<tag>.csv`, `sensor_data_<tag>.npz` and `View1..5/` (or `View1/left/`) of JPEGs.
 """
 
-import os
 from collections.abc import Collection, Mapping, Sequence
 from fnmatch import fnmatch
 from pathlib import Path
@@ -12,13 +11,11 @@ from pipeline.base.config import Source
 from pipeline.base.errors import RecordingError
 from pipeline.data.arrays import member, read_npz
 from pipeline.data.insertion import SENSOR, InsertionRecording, read_state_csv, sensor_rows
-from pipeline.data.jpeg import list_empty_views, list_views
-from pipeline.data.recording import RECORDINGS, Grouped, Stream, checked_stream
+from pipeline.data.jpeg import list_views
+from pipeline.data.recording import Stream, checked_stream
 
 _STATE_FILES = "robot_state_*.csv"
 _SENSOR_FILES = "sensor_data_*.npz"
-_METADATA = "metadata.json"
-"""Only `group` is read from this file."""
 MARKER = f"{_STATE_FILES} and {_SENSOR_FILES}"
 
 
@@ -45,11 +42,6 @@ class RawRecording(InsertionRecording):
         self._sensor_file = self._only(_SENSOR_FILES)
 
     @property
-    def group(self) -> str | None:
-        path = self.path / _METADATA
-        return RECORDINGS.read_json(path, Grouped).group_name if os.path.lexists(path) else None
-
-    @property
     def has_poses(self) -> bool:
         return True
 
@@ -68,9 +60,6 @@ class RawRecording(InsertionRecording):
             str(path),
         )
         return checked_stream(SENSOR, member(members, ("timestamps",), path), values, str(path))
-
-    def empty_views(self) -> Sequence[str]:
-        return [view for view in list_empty_views(self.path, prefix="View") if self._wants(view)]
 
     def _only(self, pattern: str) -> Path | None:
         files = sorted(self.path.glob(pattern))

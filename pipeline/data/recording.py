@@ -13,7 +13,7 @@ import os
 import re
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -29,9 +29,7 @@ from pipeline.base.digests import joint_digest
 from pipeline.base.errors import RecordingError
 from pipeline.base.source import CLOCK_SLACK_S
 
-RECORDINGS = Border(RecordingError, "Copy the file again, or leave the episode out.")
-INTACT = Border(RecordingError, "Write the file again as expected, or leave the episode out.")
-"""Refuses an undamaged file; a new copy would be refused too."""
+RECORDINGS = Border(RecordingError, "Copy or write the file again, or leave the episode out.")
 DEFAULT_LIMITS = MediaLimits()
 """Limits of a file that does not belong to a source."""
 FARTHEST_S = 1e20
@@ -39,8 +37,6 @@ FARTHEST_S = 1e20
 Seconds = Annotated[float, Field(ge=-FARTHEST_S, le=FARTHEST_S)]
 Rate = Annotated[float, Field(ge=1e-3, le=1e6)]
 """Rate of a stream, in Hz."""
-_ALWAYS_TAKEN = 256 * 2**20
-"""Unpacked bytes that are allowed at any ratio: a constant stream is packed a thousandfold."""
 _MOST_BYTES = 2**38
 """Largest allowed size of an episode's file; a larger one is refused unread."""
 ActionKind = Literal["absolute", "velocity", "delta"]
@@ -84,18 +80,6 @@ class RecordedAction(Stream):
 
     kind: ActionKind
     rate_hz: float | None
-
-
-@dataclass(frozen=True)
-class Nominal:
-    """Streams that a recording's metadata announce, and mistakes in the metadata."""
-
-    streams: Mapping[str, str] = field(default_factory=dict[str, str])
-    """Stream -> the entry which says that it was recorded, such as `robot_states_count 300`."""
-    where: str = ""
-    """The metadata's file."""
-    mistakes: tuple[str, ...] = ()
-    """Wrong entries with which the episode could still be read, each with how to correct it."""
 
 
 class CameraStream(ABC):
@@ -195,18 +179,6 @@ class Recording(ABC):
         """
         return None
 
-    def empty_views(self) -> Sequence[str]:
-        """Views that have a folder in the recording but no frame."""
-        return []
-
-    def depth_views(self) -> Sequence[str]:
-        """Cameras with depth maps; they are not views, and the model does not see them."""
-        return []
-
-    def nominal(self) -> Nominal:
-        """Streams that the recording's metadata announce, and mistakes in the metadata."""
-        return Nominal()
-
     def state(self) -> Stream | None:
         """The robot state, or None where the episode has none."""
         return None
@@ -249,7 +221,7 @@ def checked_stream(
         raise RecordingError(
             f"{where}: {len(values)} rows but {time.size} timestamps; they must agree"
         )
-    if not len(values):
+    if not values.size:
         raise RecordingError(f"{where}: the stream is empty")
     check_clock(time, where)
     check_resolution(stored, where)
@@ -310,11 +282,9 @@ def check_limit(where: Path | str, count: int, most: int, name: str, what: str) 
         ).refusal(where, f"expected at most {most:,} {what}, found {count:,}")
 
 
-def check_unpacked(where: Path | str, unpacked: int, packed: int, limits: MediaLimits) -> None:
-    """Refuse an array or table with too many unpacked bytes, or too high a ratio, before a read."""
-    ratio = max(_ALWAYS_TAKEN, int(limits.ratio * packed))
-    for most, name in ((limits.array_bytes, "array_bytes"), (ratio, "ratio")):
-        check_limit(where, unpacked, most, name, "bytes unpacked")
+def check_unpacked(where: Path | str, unpacked: int, limits: MediaLimits) -> None:
+    """Refuse an array or table with too many unpacked bytes, before it is read."""
+    check_limit(where, unpacked, limits.array_bytes, "array_bytes", "bytes unpacked")
 
 
 def content_digest(recording: Recording, digest_of: Callable[[Path], str]) -> str:

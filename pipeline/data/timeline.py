@@ -5,7 +5,6 @@ episode has begun, and end when one ends. Everything that a tick sees is at or b
 action lies ahead. An entry that is at most `rounding` later than a tick counts as at the tick.
 """
 
-from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
@@ -160,23 +159,16 @@ def rate_notes(
 
     `rates` has source, `recorded_hz` and `fastest_hz` of each episode's timeline.
     """
-    if action_hz is None:
-        return {}
     notes: dict[str, str] = {}
-    by_source: dict[str, list[tuple[float | None, float]]] = defaultdict(list)
     for source, recorded_hz, fastest_hz in rates:
-        by_source[source].append((recorded_hz, fastest_hz))
-    for source, pairs in by_source.items():
+        if action_hz is None:
+            continue
         why: list[str] = []
-        others = [hz for hz, _ in pairs if hz and abs(action_hz - hz) > RATE_TOLERANCE * hz]
-        if others:
-            low, high = f"{min(others):.3g}", f"{max(others):.3g}"
-            span = low if min(others) == max(others) else f"{low} to {high}"
-            fate = "held" if action_hz > min(others) else "left out between ticks"
-            why.append(f"recorded at {span} Hz: actions are {fate}")
-        fastest = max(hz for _, hz in pairs)
-        if action_hz > (1 + RATE_TOLERANCE) * fastest:
-            why.append(f"no stream is faster than {fastest:.3g} Hz: check data.action_hz")
+        if recorded_hz and abs(action_hz - recorded_hz) > RATE_TOLERANCE * recorded_hz:
+            fate = "held" if action_hz > recorded_hz else "left out between ticks"
+            why.append(f"recorded at {recorded_hz:.3g} Hz: actions are {fate}")
+        if action_hz > (1 + RATE_TOLERANCE) * fastest_hz:
+            why.append(f"no stream is faster than {fastest_hz:.3g} Hz: check data.action_hz")
         if why:
             notes[source] = f"ticks at {action_hz:g} Hz, {', '.join(why)}"
     return notes

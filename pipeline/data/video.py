@@ -22,10 +22,9 @@ from numpy.typing import NDArray
 
 from pipeline.base.config import MediaLimits
 from pipeline.base.errors import RecordingError
-from pipeline.data.recording import DEFAULT_LIMITS, INTACT, RECORDINGS, CameraStream, check_limit
+from pipeline.data.recording import DEFAULT_LIMITS, RECORDINGS, CameraStream, check_limit
 
 _CODECS = ("av1", "h264", "hevc", "mjpeg", "mpeg4", "vp8", "vp9")
-_AV1_DECODERS = frozenset({"libdav1d", "libaom-av1", "libgav1"})
 _CONTAINERS = {"format_whitelist": "mov,mp4,matroska,webm,avi", "protocol_whitelist": "file"}
 """No playlists, and no format that opens other files."""
 _MOST_SEEKS = 1000
@@ -132,11 +131,6 @@ class VideoClip(CameraStream):
                     "the episode out"
                 )
         table = np.array(sorted(packets, key=itemgetter(0)), np.int64).reshape(-1, 3).T
-        if (same := np.flatnonzero(np.diff(table[0]) == 0)).size:
-            raise RecordingError(
-                f"{span.path}: frames {same[0]} and {same[0] + 1} of view {self.view!r} have the "
-                "same time, so no seek tells them apart. Convert the video to MP4"
-            )
         return _FrameTable(*table)
 
 
@@ -160,11 +154,8 @@ def opened_video(
         context: Any = stream.codec_context
         codec = context.codec.canonical_name if context else "one that PyAV does not know"
         if codec not in _CODECS:
-            raise INTACT.refusal(path, f"expected a video of {', '.join(_CODECS)}, found {codec}")
-        if codec == "av1" and not _AV1_DECODERS & av.codecs_available:
-            raise RecordingError(
-                f"{path}: the video is AV1 and this PyAV build decodes none; "
-                "install a wheel that has libdav1d: pip install --upgrade av"
+            raise RECORDINGS.refusal(
+                path, f"expected a video of {', '.join(_CODECS)}, found {codec}"
             )
         check_limit(path, context.width * context.height, limits.pixels, "pixels", "pixels")
         context.options = {"max_pixels": str(limits.pixels)}

@@ -23,15 +23,13 @@ from pipeline.data.arrays import Numbers, member, read_npz
 from pipeline.data.insertion import (
     SENSOR,
     InsertionRecording,
-    promised,
     read_robot_states,
     robot_state_file,
 )
-from pipeline.data.jpeg import list_empty_views, list_views, split_eye
+from pipeline.data.jpeg import list_views, split_eye
 from pipeline.data.recording import (
     RECORDINGS,
     Grouped,
-    Nominal,
     Rate,
     Seconds,
     Stream,
@@ -61,7 +59,6 @@ class _Metadata(Grouped):
     sensor_hz: Rate | None = None
     robot_states_count: _Count | None = None
     sensor_windows_count: _Count | None = None
-    camera_frames_count: _Count | None = None
     camera_views: tuple[Text, ...] | None = None
     instruction: Text | None = None
 
@@ -87,10 +84,9 @@ class WindowedRecording(InsertionRecording):
         return self._metadata.group_name
 
     def state(self) -> Stream | None:
-        path = robot_state_file(self.path)
+        path, metadata = robot_state_file(self.path), self._metadata
         if path is None:
-            return None
-        metadata = self._metadata
+            return self._absent("robot_states_count", self.path / "robot_states.npz")
         times = (metadata.start_time, metadata.robot_hz, metadata.end_time)
         stream = read_robot_states(path, self._overrides.limits, *times)
         self._check_count("robot_states_count", len(stream.time), path)
@@ -99,7 +95,7 @@ class WindowedRecording(InsertionRecording):
     def sensor(self) -> Stream | None:
         path = self.path / _SENSOR_FILE
         if not os.path.lexists(path):
-            return None
+            return self._absent("sensor_windows_count", path)
         members = read_npz(path, ("timestamps", "data"), limits=self._overrides.limits)
         stored = member(members, ("timestamps",), path)
         ends = stored.astype(np.float64)
@@ -117,22 +113,17 @@ class WindowedRecording(InsertionRecording):
             return None
         check_clock(ends, f"{path}, member 'timestamps'")
         check_resolution(stored, f"{path}, member 'timestamps'")
-        time, values = rebuild(ends, windows, self._metadata.sensor_hz, str(path))
+        if (sensor_hz := self._metadata.sensor_hz) is None:
+            raise RecordingError(f"{self._metadata_file}: windows need a sensor_hz; add it")
+        time, values = rebuild(ends, windows, sensor_hz, str(path))
         return checked_stream(SENSOR, time, values, str(path))
-
-    def empty_views(self) -> Sequence[str]:
-        return [view for view in list_empty_views(self.path / "images") if self._wants(view)]
-
-    def nominal(self) -> Nominal:
-        streams = promised(
-            self._metadata,
-            sensor=("sensor_windows_count", "sensor_hz"),
-            state=("robot_states_count", "robot_hz"),
-        )
-        return Nominal(streams, MARKER)
 
     def _recorded_instruction(self) -> str:
         return self._metadata.instruction or super()._recorded_instruction()
+
+    def _absent(self, key: str, path: Path) -> None:
+        """Refuse an absent file of which the metadata count rows."""
+        self._check_count(key, 0, path)
 
     def _check_count(self, key: str, rows: int, path: Path) -> None:
         count = getattr(self._metadata, key)
@@ -143,26 +134,22 @@ class WindowedRecording(InsertionRecording):
             )
 
     def _view_files(self) -> Mapping[str, list[Path]]:
-        views, metadata = list_views(self.path / "images"), self._metadata
+        views, listed = list_views(self.path / "images"), self._metadata.camera_views or ()
         recorded = {split_eye(view)[0] for view in views}
-        listed = {split_eye(view)[0] for view in metadata.camera_views or () if self._wants(view)}
-        most = max(map(len, views.values()), default=0)
-        if lost := sorted(listed - recorded):
-            what = f"camera_views has {', '.join(lost)}, and images/ no frame of it"
-        elif self._views is None and most < (metadata.camera_frames_count or 0):
-            what = f"camera_frames_count is {metadata.camera_frames_count}, and images/ has {most}"
-        else:
-            return views
-        raise RecordingError(
-            f"{self._metadata_file}: {what}. Copy the episode again, or correct the metadata"
-        )
+        lost = [view for view in listed if self._wants(view) and split_eye(view)[0] not in recorded]
+        if lost:
+            raise RecordingError(
+                f"{self._metadata_file}: camera_views has {', '.join(lost)}, and images/ no frame "
+                "of it. Copy the episode again, or correct the metadata"
+            )
+        return views
 
     def _data_files(self) -> Sequence[Path | None]:
         return [self._metadata_file, self.path / _SENSOR_FILE, robot_state_file(self.path)]
 
 
 def rebuild(
-    ends: NDArray[np.float64], windows: Numbers, sensor_hz: float | None, where: str
+    ends: NDArray[np.float64], windows: Numbers, sensor_hz: float, where: str
 ) -> tuple[NDArray[np.float64], Numbers]:
     """Clock (reading,) s and readings (reading, channel) without the duplicates.
 
@@ -174,13 +161,12 @@ def rebuild(
     _check_finite(windows, where)
     width = windows.shape[1]
     fresh = np.array([width, *_strides(ends, windows, sensor_hz, where)])
-    rate_hz = sensor_hz or _estimated_rate(ends, fresh, where)
     usual = np.median(fresh[1:]) if len(ends) > 1 else width
-    times = [ends[0] - np.arange(width)[::-1] / rate_hz]
+    times = [ends[0] - np.arange(width)[::-1] / sensor_hz]
     for previous, end, count in zip(ends[:-1], ends[1:], fresh[1:], strict=True):
-        missing = (end - previous) * rate_hz - count
+        missing = (end - previous) * sensor_hz - count
         if missing > 0.5 * min(usual, count):
-            times.append(end - np.arange(count)[::-1] / rate_hz)
+            times.append(end - np.arange(count)[::-1] / sensor_hz)
         else:
             times.append(previous + (end - previous) * np.arange(1, count + 1) / max(count, 1))
     values = [window[width - count :] for window, count in zip(windows, fresh, strict=True)]
@@ -188,23 +174,24 @@ def rebuild(
 
 
 def _strides(
-    ends: NDArray[np.float64], windows: Numbers, sensor_hz: float | None, where: str
+    ends: NDArray[np.float64], windows: Numbers, sensor_hz: float, where: str
 ) -> list[int]:
     """How many new readings each window after the first has."""
     width = windows.shape[1]
     if len(ends) < 2:
         return []
-    steps = np.diff(ends)
+    expected = np.diff(ends) * sensor_hz
     proved = _proved_stride(windows)
-    if sensor_hz is not None:
-        expected = steps * sensor_hz
-        # If windows abut by the clock, a reading that the sensor repeats looks like an overlap.
-        shared = windows[1:, : width - proved] if proved else windows[1:, :0]
-        abut = abs(np.median(expected) - width) <= 0.1 * width
-        if not abut or (shared != shared[:, :1]).any():
-            _check_rate(steps, proved, sensor_hz, where)
-    else:
-        expected = steps / (np.median(steps) or np.inf) * (proved or width)
+    # A reading that the sensor repeats looks like an overlap of windows that abut by the clock.
+    # Gaps change the mean step, and stamps in bursts the median; one of the two must agree.
+    steps = (float(np.median(expected)), float(expected.mean()))
+    abut = abs(steps[0] - width) <= 0.1 * width
+    if proved and not abut and all(abs(step - proved) > 0.1 * proved for step in steps):
+        raise RecordingError(
+            f"{where}: expected windows to advance by {max(steps):.4g} readings by the clock and "
+            f"sensor_hz {sensor_hz:g} in {MARKER}, found {proved} by their readings; sensor_hz "
+            f"{proved * sensor_hz / (max(steps) or np.inf):.4g} would fit: correct the metadata"
+        )
     typical = float(np.median(expected))
     usual = proved or min(round(typical), width)
     overlapping = typical < _OVERLAP * width
@@ -224,22 +211,6 @@ def _strides(
             )
         strides.append(stride)
     return strides
-
-
-def _check_rate(
-    steps: NDArray[np.float64], proved: int | None, sensor_hz: float, where: str
-) -> None:
-    """Refuse a `sensor_hz` that differs by more than 10 % from clock and overlap.
-
-    Gaps change the mean step, and stamps in bursts the median; one of the two must agree.
-    """
-    usual, mean = float(np.median(steps)), float(steps.mean())
-    if proved and all(abs(step * sensor_hz - proved) > 0.1 * proved for step in (usual, mean)):
-        raise RecordingError(
-            f"{where}: windows advance by {proved} readings every {usual or mean:.4g} s, "
-            f"{proved / (usual or mean or np.inf):.4g} Hz, but sensor_hz in {MARKER} says "
-            f"{sensor_hz:g}; they must agree: correct the metadata"
-        )
 
 
 def _check_finite(windows: Numbers, where: str) -> None:
@@ -272,13 +243,3 @@ def _first_rows(previous: Numbers, window: Numbers) -> Sequence[int]:
 
 def _agree(previous: Numbers, window: Numbers, stride: int) -> bool:
     return np.array_equal(previous[stride:], window[: len(window) - stride])
-
-
-def _estimated_rate(ends: NDArray[np.float64], fresh: NDArray[np.int64], where: str) -> float:
-    steps = np.diff(ends)
-    if not steps.size or not np.median(steps) > 0:
-        raise RecordingError(
-            f"{where}: the readings inside a window cannot be dated: metadata.json has no "
-            "sensor_hz, and the window times do not tell"
-        )
-    return float(np.median(fresh[1:]) / np.median(steps))

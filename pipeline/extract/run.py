@@ -142,9 +142,6 @@ def _survey_lines(surveyed: Survey) -> Iterator[str]:
                 yield f"source {source.name!r}: {outside}, so DVC does not watch it"
     missing = [f"not there: {line}" for line in surveyed.missing]
     yield from capped(missing, "episodes that are not there", MOST_EPISODES)
-    depth = {(r.source, view) for r in surveyed.recordings for view in r.depth_views()}
-    for source, view in sorted(depth):
-        yield f"source {source!r}: view {view} is a depth map, no picture, and is left out"
     skipped = [f"skipped {bad.source}: {bad.reason}" for bad in surveyed.bad]
     yield from capped(skipped, "skipped episodes", MOST_EPISODES)
 

@@ -13,7 +13,6 @@ from pipeline.base.config import InspectParams, Params, Source
 from pipeline.base.errors import ConfigError, RecordingError
 from pipeline.base.files import REPORT, refuse_foreign
 from pipeline.data import Opened, open_recordings
-from pipeline.data.discovery import meant
 
 STORE = (".zarr", ".zarr.part")
 
@@ -60,8 +59,9 @@ def subject_of(params: Params) -> Subject:
     for path in (Path(place) for place in places if not glob.has_magic(place)):
         if not path.is_dir():
             thing = f"the file {path}" if path.exists() else f"nothing at {path}"
-            remedy = meant(path.absolute()) or "Name the folder of recordings, or a store"
-            raise ConfigError(f"inspect.path: expected a folder, found {thing}. {remedy}")
+            raise ConfigError(
+                f"inspect.path: expected a folder, found {thing}. Name recordings or a store"
+            )
     matches = [
         Path(match)
         for place in places

@@ -44,7 +44,7 @@ from pipeline.base.files import (
     write_document,
 )
 from pipeline.data.lerobot import ACTION, STATE
-from pipeline.data.lerobot_writer import write_sidecar, write_v30
+from pipeline.data.lerobot_writer import LeRobotEpisode, write_data_set, write_sidecar
 from pipeline.data.recording import RECORDINGS
 
 RUN: Final = "run.json"
@@ -394,4 +394,5 @@ def _write_rows(
     digest = np.array([str(metadata.get("feature_spec_digest", ""))])
     used = {name: rows[name] for name in ("answer", "key", "age_s")}
     write_sidecar(root, "features", used | {"feature_spec_digest": digest})
-    write_v30(root, columns, images, features, run.instruction, metadata["action_hz"])
+    episode = LeRobotEpisode(columns, images=images)
+    write_data_set(root, [episode], features, run.instruction, metadata["action_hz"])

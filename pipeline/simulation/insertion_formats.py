@@ -1,4 +1,4 @@
-"""Writers of simulated episodes: the needle-insertion recorder's three formats, and LeRobot v2.1.
+"""Writers of simulated episodes: the needle-insertion recorder's three formats, and LeRobot v3.0.
 
 `write_raw`, `write_new` and `write_old` write one episode into its task's folder, as that
 generation of the recorder left it. `write_lerobot` writes a whole data set.
@@ -18,7 +18,7 @@ from PIL import Image
 from pipeline.data.insertion import CLOCK, SENSOR, STATE
 from pipeline.data.lerobot import ACTION as ACTION_KEY
 from pipeline.data.lerobot import STATE as STATE_KEY
-from pipeline.data.lerobot_writer import FilmedRows, write_sidecar, write_v21
+from pipeline.data.lerobot_writer import LeRobotEpisode, write_data_set, write_sidecar
 from pipeline.data.pickled import ACTION
 from pipeline.simulation.arm import euler_actions
 from pipeline.simulation.insertion import INSTRUCTION, STATE_HZ, TICK_HZ, TICK_S
@@ -143,7 +143,7 @@ def write_old(task: Path, episode: SimulatedEpisode) -> None:
 
 
 def write_lerobot(root: Path, episodes: Iterable[SimulatedEpisode]) -> None:
-    """Write a LeRobot v2.1 data set, with the sensor in sidecars; episodes are taken one at a time.
+    """Write a LeRobot v3.0 data set, with the sensor in sidecars; episodes are taken one at a time.
 
     Rows are on LeRobot's own clock, k / fps from the first. The sidecars' times are on that clock
     too; the sensor begins before the first row, at a negative time.
@@ -153,10 +153,10 @@ def write_lerobot(root: Path, episodes: Iterable[SimulatedEpisode]) -> None:
         for key, channels in ((STATE_KEY, STATE), (ACTION_KEY, ACTION))
     }
     rows = _lerobot_rows(root, episodes)
-    write_v21(root, rows, features, INSTRUCTION, TICK_HZ, "simulated_meca500")
+    write_data_set(root, rows, features, INSTRUCTION, TICK_HZ, "simulated_meca500")
 
 
-def _lerobot_rows(root: Path, episodes: Iterable[SimulatedEpisode]) -> Iterator[FilmedRows]:
+def _lerobot_rows(root: Path, episodes: Iterable[SimulatedEpisode]) -> Iterator[LeRobotEpisode]:
     """The rows of each episode, after its sidecar is written."""
     for index, episode in enumerate(episodes):
         begin = episode.epoch_s + TICK_S
@@ -178,7 +178,7 @@ def _lerobot_rows(root: Path, episodes: Iterable[SimulatedEpisode]) -> Iterator[
             f"observation.images.{view}": np.stack([*episode.frames(view, time[:-1])])
             for view in VIEWS
         }
-        yield FilmedRows(columns, frames)
+        yield LeRobotEpisode(columns, frames)
 
 
 def _write_state_csv(path: Path, episode: SimulatedEpisode, time: NDArray[np.float64]) -> None:

@@ -5,12 +5,11 @@ transformers and peft read the documents themselves, after the checks of this mo
 
 import json
 import sys
-from collections.abc import Generator, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Literal
 
-from pydantic import Field, JsonValue, model_validator
+from pydantic import Field, JsonValue
 from safetensors import safe_open
 
 from pipeline.base.border import Border, Document
@@ -35,7 +34,7 @@ _WANTED = ["*.json", "*.safetensors", "*.txt", "*.jinja"]
 _DTYPES = {"F32", "F16", "BF16"}
 """The allowed dtypes of weights, in safetensors' names."""
 
-_INDEX = "model.safetensors.index.json"
+_WHOLE, _INDEX = "model.safetensors", "model.safetensors.index.json"
 
 _QUANTIZED = "quantization_config"
 _REFUSED = {
@@ -130,41 +129,10 @@ def tuned_on(vlm: VLMParams) -> TunedOn | None:
     return join_tuned_on(map(read_tuned_on, folders))
 
 
-class _Text(Document):
-    """Entries whose default in transformers could give other features with the same weights."""
-
-    hidden_size: int
-    num_hidden_layers: int
-    num_attention_heads: int
-    max_position_embeddings: int
-    rms_norm_eps: float
-
-
-class _Vision(Document):
-    hidden_size: int | None = None
-    num_heads: int | None = None
-    fullatt_block_indexes: list[int] | None = None
-
-    @model_validator(mode="after")
-    def _defaults_are_the_released(self) -> Self:
-        """Versions before 4.51 omit transformers' defaults, which fit the released tower."""
-        if self.hidden_size != 1280 and None in (self.num_heads, self.fullatt_block_indexes):
-            raise ValueError("expected num_heads and fullatt_block_indexes")
-        return self
-
-
 class _Config(Document):
-    """config.json, before transformers adds its defaults; on the hub it is flat."""
+    """config.json, as far as transformers would read that of another model too."""
 
     model_type: Literal["qwen2_5_vl"]
-    text_config: _Text
-    vision_config: _Vision
-
-    @model_validator(mode="before")
-    @classmethod
-    def _nest(cls, given: Any) -> Any:
-        flat = isinstance(given, dict) and given.get("text_config") is None
-        return {**given, "text_config": given} if flat else given
 
 
 class _WeightIndex(Document):
@@ -191,7 +159,8 @@ def read_config(folder: Path) -> Any:
     check_documents(folder)
     path = folder / "config.json"
     what = "cannot be read as the config of a Qwen2.5-VL"
-    with quiet_transformers(), VLMS.foreign(path, what):
+    quiet_transformers()
+    with VLMS.foreign(path, what):
         config: Any = Qwen2_5_VLConfig.from_pretrained(
             folder, local_files_only=True, trust_remote_code=False
         )
@@ -217,8 +186,8 @@ def read_config(folder: Path) -> Any:
 
 
 def check_documents(folder: Path) -> None:
-    """Raise `VLMError` unless a checkpoint is a Qwen2.5-VL with a complete config, not quantized,
-    without its own code, whose documents, templates and texts are regular files."""
+    """Raise `VLMError` unless a checkpoint is a Qwen2.5-VL, not quantized, without its own code,
+    whose documents, templates and texts are regular files."""
     small_files(folder)
     VLMS.read_json(folder / "config.json", _Config)
     _refuse_code(folder, VLMS)
@@ -233,24 +202,16 @@ def small_files(folder: Path) -> list[Path]:
     return files
 
 
-@contextmanager
-def quiet_transformers() -> Generator[None]:
+def quiet_transformers() -> None:
     """Keep transformers' reports off stderr, and its progress bars too unless that is a terminal.
 
     This project checks what they warn of, and raises `VLMError`.
     """
     from transformers.utils import logging
 
-    verbosity, bar = logging.get_verbosity(), logging.is_progress_bar_enabled()
     logging.set_verbosity_error()
     if not sys.stderr.isatty():
         logging.disable_progress_bar()
-    try:
-        yield
-    finally:
-        logging.set_verbosity(verbosity)
-        if bar:
-            logging.enable_progress_bar()
 
 
 def _refuse_code(folder: Path, border: Border) -> None:
@@ -275,8 +236,8 @@ def _entries(document: JsonValue) -> Iterator[tuple[str, JsonValue]]:
 def tensor_shapes(files: Sequence[Path], border: Border = VLMS) -> dict[str, list[int]]:
     """Shape of each tensor in the safetensors files among these; reads no weight.
 
-    Raises `VLMError` where a file is truncated or damaged, where two files have a tensor of the
-    same name, and where a tensor is not float, because it would be loaded as if it were.
+    Raises `VLMError` where a file is truncated or damaged, and where a tensor is not float, because
+    it would be loaded as if it were.
     """
     shapes: dict[str, list[int]] = {}
     for path in (path for path in files if path.suffix == ".safetensors"):
@@ -284,8 +245,6 @@ def tensor_shapes(files: Sequence[Path], border: Border = VLMS) -> dict[str, lis
         with border.foreign(path, "cut off or damaged"), safe_open(path, "numpy") as file:
             tensors = {name: file.get_slice(name) for name in file.keys()}  # noqa: SIM118
             dtypes = {name: tensor.get_dtype() for name, tensor in tensors.items()}
-        if twice := shapes.keys() & tensors:
-            raise border.refusal(path, f"{min(twice)} stands in another file too")
         other = [f"{name} of {dtype}" for name, dtype in dtypes.items() if dtype not in _DTYPES]
         if other:
             why = f"expected {_PLAIN}, found {len(other)} of others, such as {other[0]}"
@@ -297,42 +256,33 @@ def tensor_shapes(files: Sequence[Path], border: Border = VLMS) -> dict[str, lis
 def weight_files(folder: Path) -> list[Path]:
     """Every file that decides the weights, sorted: config.json, safetensors and their index.
 
-    Raises `VLMError` where there are no weights, where the index names a missing file, where
-    transformers would load other files than these, where a file is damaged, and where weights are
-    not float32, float16 or bfloat16.
+    Raises `VLMError` where there are no weights, where the index names a missing file, where a file
+    is damaged, and where weights are not float32, float16 or bfloat16.
     """
     if (folder / "adapter_config.json").exists():
         raise VLMError(
             f"{folder}: holds an adapter_config.json, so transformers could load an adapter "
             "unasked. Move the adapter to a folder of its own and name that as vlm.adapter."
         )
-    files, whole = _present_weights(folder), folder / "model.safetensors"
-    shards = {path for path in files if path.suffix == ".safetensors"}
-    # transformers loads model.safetensors and ignores the index.
-    if folder / _INDEX in files and whole.exists() and shards != {whole}:
-        raise VLMError(
-            f"{folder}: ambiguous: it has both {whole.name} and {_INDEX}, which names other "
-            f"files. Remove {whole.name} if the shards are the checkpoint, else {_INDEX} and the "
-            "shards."
-        )
+    files = _present_weights(folder)
     check_documents(folder)
     tensor_shapes(files)
     return files
 
 
 def _present_weights(folder: Path) -> list[Path]:
+    """The files that transformers loads: `model.safetensors`, or else the shards of an index."""
     weights = {path.name for path in folder.glob("*.safetensors")}
-    listed = weights
-    if (folder / _INDEX).exists():
-        listed = set(VLMS.read_json(folder / _INDEX, _WeightIndex).weight_map.values())
+    if not weights:
+        why = "no *.safetensors file; pickled weights (*.bin, *.pt) are not opened"
+        raise VLMS.refusal(folder, why)
+    if _WHOLE in weights or not (folder / _INDEX).exists():
+        return sorted(folder / name for name in {_WHOLE, "config.json"})
+    listed = set(VLMS.read_json(folder / _INDEX, _WeightIndex).weight_map.values())
     if missing := sorted(listed - weights):
         why = f"names {len(listed)} weight files, missing: {', '.join(missing)}"
         raise VLMS.refusal(folder / _INDEX, why)
-    if not listed:
-        why = "no *.safetensors file; pickled weights (*.bin, *.pt) are not opened"
-        raise VLMS.refusal(folder, why)
-    beside = {"config.json", _INDEX} if (folder / _INDEX).exists() else {"config.json"}
-    return sorted(folder / name for name in listed | beside)
+    return sorted(folder / name for name in listed | {"config.json", _INDEX})
 
 
 def tokenizer_files(folder: Path) -> list[Path]:

@@ -56,8 +56,8 @@ def _write(folder: Path, seed: int) -> None:
     for name in ("tokenizer_config.json", "preprocessor_config.json"):
         shutil.copyfile(_FILES / name, folder / name)
     _train_tokenizer().save(str(folder / "tokenizer.json"))
-    with quiet_transformers():
-        _build_model(seed).save_pretrained(folder)
+    quiet_transformers()
+    _build_model(seed).save_pretrained(folder)
 
 
 def _train_tokenizer() -> Tokenizer:

@@ -10,18 +10,17 @@ from typing import Any
 
 import torch
 from jaxtyping import Bool, Float
-from safetensors.torch import load_file
 from torch import Tensor, nn
 
 from pipeline.base.config import TuningParams, VLMParams
 from pipeline.base.digests import file_digest
 from pipeline.base.errors import CheckpointMismatch, VLMError
-from pipeline.base.files import disk_full_named, sync, write_tensors
+from pipeline.base.files import disk_full_named, sync
 from pipeline.base.machine import resolve_device
 from pipeline.base.text import capped
-from pipeline.vlm.checkpoint_folder import quiet_transformers, resolve_checkpoint
+from pipeline.vlm.checkpoint_folder import resolve_checkpoint
 from pipeline.vlm.feature_spec import FeatureSpec, feature_spec, live_differences
-from pipeline.vlm.loading import adapted, cut, load_checkpoint, load_model, load_whole
+from pipeline.vlm.loading import cut, load_checkpoint, load_model, load_whole
 from pipeline.vlm.preparation import PreparedRow
 from pipeline.vlm.processor import PixelSettings
 from pipeline.vlm.qwen import Extractor, layers_needed
@@ -84,7 +83,6 @@ class LiveVLM(nn.Module):
         self.model = model
         self.spec, self.vlm, self.tuning = spec, vlm, tuning
         self._extractor = extractor
-        self._beyond: dict[str, Tensor] = {}
 
     @classmethod
     def load(
@@ -92,9 +90,8 @@ class LiveVLM(nn.Module):
     ) -> "LiveVLM":
         """The checkpoint of `vlm`, cut after the last layer needed; `tuning` decides what learns.
 
-        With `vlm.adapter`, `lora` continues to train that adapter; `none` and `full` merge it
-        first. Raises `VLMError` like `FrozenVLM.load`, where the adapter does not match `tuning`,
-        and for float16, whose gradients underflow.
+        `vlm.adapter` is merged first. Raises `VLMError` like `FrozenVLM.load`, for `lora` on top of
+        an adapter, and for float16, whose gradients underflow.
         """
         target = resolve_device(device)
         layers = layers_needed(spec.slots)
@@ -104,13 +101,12 @@ class LiveVLM(nn.Module):
                 "tune the model."
             )
         model: Any
-        beyond: dict[str, Tensor] = {}
         if tuning.method == "none":
             model = inner = load_model(vlm, layers, target)
         elif tuning.method == "full":
             model = inner = _load_learning(vlm, tuning, spec.slots, layers, target)
         else:
-            model, beyond = _load_adapting(vlm, tuning, layers, target)
+            model = _load_adapting(vlm, tuning, layers, target)
             inner = model.base_model.model.model
         if tuning.method != "none" and tuning.gradient_checkpointing:
             inner.activation_checkpointing_enable({"use_reentrant": False})
@@ -118,9 +114,7 @@ class LiveVLM(nn.Module):
             # gradients would refuse; non-reentrant checkpoints need no such input.
             inner.disable_input_require_grads()
         extractor = Extractor(inner, PixelSettings.of(vlm), spec.slots)
-        live = cls(model.to(target), extractor, spec, vlm, tuning)
-        live._beyond = beyond
-        return live
+        return cls(model.to(target), extractor, spec, vlm, tuning)
 
     def forward(
         self, rows: Sequence[PreparedRow]
@@ -155,7 +149,7 @@ class LiveVLM(nn.Module):
             return
         folder.mkdir(parents=True, exist_ok=True)
         if self.tuning.method == "lora":
-            _save_adapter(folder, self.model, self._beyond)
+            _save_adapter(folder, self.model)
         else:
             _save_checkpoint(folder, self.vlm, self.model.state_dict())
 
@@ -166,32 +160,27 @@ class LiveVLM(nn.Module):
         return torch.autocast(device, getattr(torch, self.vlm.dtype) if half else None, half)
 
 
-def _load_adapting(
-    vlm: VLMParams, tuning: TuningParams, layers: int, device: torch.device
-) -> tuple[Any, dict[str, Tensor]]:
+def _load_adapting(vlm: VLMParams, tuning: TuningParams, layers: int, device: torch.device) -> Any:
     """A `PeftModel` of the first `layers` layers whose low-rank adapters learn, on the CPU.
 
-    There is one on every linear layer of the chosen towers; with `vlm.adapter`, training continues
-    from that adapter. Also returns that adapter's weights on later layers, which a saved adapter
-    keeps. Raises `VLMError` where the adapter has another rank, scale or towers than `tuning`.
+    There is one on every linear layer of the chosen towers.
     """
+    if vlm.adapter is not None:
+        raise VLMError(
+            f"vlm.adapter {vlm.adapter}: lora begins from a checkpoint without an adapter. Set "
+            "vlm.adapter to null, or finetune.tuning.method to full, which merges it first."
+        )
     whole = load_checkpoint(vlm, device)
     # Features do not use the head.
     whole.lm_head = nn.Identity()
-    if vlm.adapter is None:
-        model, beyond = _fresh_adapter(whole, vlm, tuning, layers), {}
-    else:
-        model = adapted(whole, vlm, tuning.lora_dropout)
-        _check_goes_on(model, vlm, tuning)
-        beyond = _beyond(model, layers)
+    model = _fresh_adapter(whole, tuning, layers)
     cut(whole, layers)
     model.requires_grad_(False)
-    learning = tuple(f"base_model.model.{_TOWERS[tower]}" for tower in tuning.towers)
     for name, parameter in model.named_parameters():
-        parameter.requires_grad = "lora_" in name and name.startswith(learning)
+        parameter.requires_grad = "lora_" in name
     model.peft_config["default"].base_model_name_or_path = vlm.checkpoint
     model.peft_config["default"].revision = vlm.revision
-    return model, beyond
+    return model
 
 
 def _load_learning(
@@ -211,19 +200,13 @@ def _load_learning(
     return whole.model
 
 
-def _save_adapter(folder: Path, model: Any, beyond: Mapping[str, Tensor]) -> None:
-    """Write the adapter of a `PeftModel` in peft's format, with its weights on later layers.
-
-    Raises `DiskFull`.
-    """
-    weights = folder / "adapter_model.safetensors"
+def _save_adapter(folder: Path, model: Any) -> None:
+    """Write the adapter of a `PeftModel` in peft's format. Raises `DiskFull`."""
     with disk_full_named(folder):
         # Otherwise peft asks the hub whether embeddings were resized, which never happens here.
         model.save_pretrained(str(folder), save_embedding_layers=False)
         # An empty template of a model card.
         (folder / "README.md").unlink(missing_ok=True)
-        if beyond:
-            write_tensors(weights, load_file(weights) | dict(beyond))
         _finish(folder)
 
 
@@ -238,14 +221,14 @@ def _save_checkpoint(folder: Path, vlm: VLMParams, tuned: Mapping[str, Tensor]) 
     report = whole.model.load_state_dict(dict(tuned), strict=False)
     assert not report.unexpected_keys, report.unexpected_keys
     base = resolve_checkpoint(vlm.checkpoint, vlm.revision)
-    with disk_full_named(folder), quiet_transformers():
+    with disk_full_named(folder):
         whole.save_pretrained(folder)
         for path in (path for pattern in _COMPANIONS for path in base.glob(pattern)):
             shutil.copyfile(path, folder / path.name)
         _finish(folder)
 
 
-def _fresh_adapter(whole: Any, vlm: VLMParams, tuning: TuningParams, layers: int) -> Any:
+def _fresh_adapter(whole: Any, tuning: TuningParams, layers: int) -> Any:
     from peft import LoraConfig, get_peft_model
 
     config = LoraConfig(
@@ -273,38 +256,6 @@ def _targets(whole: Any, tuning: TuningParams, layers: int) -> str:
             pattern = re.sub(r"(blocks\\\.)\d+", r"\1\\d+", re.escape(name))
             patterns[re.sub(r"(layers\\\.)\d+", rf"\1({kept})", pattern)] = None
     return "|".join(patterns)
-
-
-def _check_goes_on(model: Any, vlm: VLMParams, tuning: TuningParams) -> None:
-    config = model.peft_config["default"]
-    # Other kinds of adapters lack them.
-    r, alpha = (getattr(config, name, None) for name in ("r", "lora_alpha"))
-    actual = f"lora_r {r}, lora_alpha {alpha}"
-    asked = f"lora_r {tuning.lora_r}, lora_alpha {tuning.lora_alpha}"
-    if actual != asked:
-        raise VLMError(
-            f"{vlm.adapter}: tuning goes on from this adapter of {actual}, but {asked} is asked "
-            "for. Set finetune.tuning to the adapter's values, or vlm.adapter to null."
-        )
-    names = [name for name, _ in model.named_parameters() if "lora_" in name]
-    for tower in tuning.towers:
-        if not any(name.startswith(f"base_model.model.{_TOWERS[tower]}") for name in names):
-            raise VLMError(
-                f"{vlm.adapter}: tuning goes on from this adapter, which has nothing in the "
-                f"{tower} tower. Leave it out of finetune.tuning.towers, or set vlm.adapter to "
-                "null."
-            )
-
-
-def _beyond(model: Any, layers: int) -> dict[str, Tensor]:
-    """The adapter's weights on decoder layers that do not run, by name in its file."""
-    place = re.compile(r"\.language_model\.layers\.(\d+)\..*\.lora_")
-    weights = ((name, place.search(name), tensor) for name, tensor in model.state_dict().items())
-    return {
-        name.replace(".default.", "."): tensor
-        for name, match, tensor in weights
-        if match and int(match[1]) >= layers
-    }
 
 
 def _finish(folder: Path) -> None:

@@ -1,7 +1,6 @@
 """A checkpoint folder and an optional adapter -> the inner model; checks every weight."""
 
 import warnings
-from math import prod
 from pathlib import Path
 from typing import Any
 
@@ -17,10 +16,8 @@ from pipeline.vlm.checkpoint_folder import (
     ADAPTERS,
     VLMS,
     adapter_files,
-    quiet_transformers,
     read_config,
     resolve_checkpoint,
-    tensor_shapes,
     weight_files,
 )
 from pipeline.vlm.vision import tower_attention
@@ -50,7 +47,7 @@ def load_whole(vlm: VLMParams, device: torch.device, dtype: str | None = None) -
     whole = load_checkpoint(vlm, device, dtype)
     if vlm.adapter is None:
         return whole
-    adapting = adapted(whole, vlm)
+    adapting = _adapted(whole, vlm)
     with ADAPTERS.foreign(Path(vlm.adapter), "this adapter cannot be merged"):
         return adapting.merge_and_unload(safe_merge=True)
 
@@ -98,7 +95,7 @@ def load_checkpoint(vlm: VLMParams, device: torch.device, dtype: str | None = No
             f"{device.type} and {vlm.dtype}. Set vlm.attention to auto."
         )
     config = read_config(folder)
-    with quiet_transformers(), VLMS.foreign(folder, "cannot be loaded as Qwen2.5-VL"):
+    with VLMS.foreign(folder, "cannot be loaded as Qwen2.5-VL"):
         loaded: Any = Qwen2_5_VLForConditionalGeneration.from_pretrained(
             folder,
             config=config,
@@ -115,20 +112,15 @@ def load_checkpoint(vlm: VLMParams, device: torch.device, dtype: str | None = No
     for name, found, wanted in report["mismatched_keys"]:
         why = f"expected {name} of {list(wanted)} by config.json, found {list(found)}"
         raise VLMS.refusal(folder, why)
-    shapes = tensor_shapes(files)
-    held = sum(prod(shape) for name, shape in shapes.items() if name not in _UNUSED)
-    if held != sum(tensor.numel() for tensor in model.model.state_dict().values()):
-        raise VLMS.refusal(folder, "a tensor stands there by two names")
     return model
 
 
-def adapted(whole: Any, vlm: VLMParams, dropout: float | None = None) -> Any:
+def _adapted(whole: Any, vlm: VLMParams) -> Any:
     """The model with `vlm.adapter` on it, not merged: a `PeftModel`.
 
-    With a `dropout` the adapter continues to learn, with that dropout. Raises `VLMError` where the
-    adapter does not fit the checkpoint.
+    Raises `VLMError` where the adapter does not fit the checkpoint.
     """
-    from peft import PeftConfig, PeftModel
+    from peft import PeftModel
 
     assert vlm.adapter is not None, "no adapter to load"
     folder = resolve_checkpoint(vlm.adapter, setting="vlm.adapter")
@@ -137,14 +129,8 @@ def adapted(whole: Any, vlm: VLMParams, dropout: float | None = None) -> Any:
     with warnings.catch_warnings(), ADAPTERS.foreign(folder, what):
         # peft only warns about missing weights, so the report of a second load is checked.
         warnings.simplefilter("ignore")
-        config: Any = PeftConfig.from_pretrained(str(folder))
-        if dropout is not None:
-            config.lora_dropout = dropout
-        learns = dropout is not None
-        adapting: Any = PeftModel.from_pretrained(
-            whole, str(folder), config=config, is_trainable=learns
-        )
-        report = adapting.load_adapter(str(folder), adapter_name="default", is_trainable=learns)
+        adapting: Any = PeftModel.from_pretrained(whole, str(folder))
+        report = adapting.load_adapter(str(folder), adapter_name="default")
     unexpected = set(report.unexpected_keys)
     _refuse_strange(folder, set(report.missing_keys), unexpected, _ADAPTER_FILES)
     return adapting

@@ -4,7 +4,6 @@ The CPU only stretches frames (Pillow), without torch; `qwen` cuts them into pat
 model's device.
 """
 
-import json
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -19,7 +18,6 @@ from pipeline.base.config import VLMParams
 from pipeline.base.errors import VLMError
 from pipeline.vlm.checkpoint_folder import (
     VLMS,
-    quiet_transformers,
     read_config,
     resolve_checkpoint,
     tokenizer_files,
@@ -62,7 +60,7 @@ class PromptRenderer:
         if (path := folder / "tokenizer_config.json").exists():
             VLMS.read_json(path, _TokenizerConfig)
         what = "its config.json, tokenizer.json or tokenizer_config.json cannot be read"
-        with quiet_transformers(), VLMS.foreign(folder, what):
+        with VLMS.foreign(folder, what):
             self._tokenizer: Any = AutoTokenizer.from_pretrained(
                 folder, local_files_only=True, trust_remote_code=False
             )
@@ -140,14 +138,6 @@ class PromptRenderer:
                 f"{self.image_token_id} as {self._image_token!r}, and has {len(self._tokenizer)} "
                 f"tokens of a vocabulary of {rows}",
             )
-
-        model = json.loads(self._tokenizer.backend_tokenizer.to_str())["model"]
-        # Each token of several characters comes from a merge, except the control tokens.
-        made = sum(len(token) > 1 and token[0] + token[-1] != "<>" for token in model["vocab"])
-        if len(model["merges"]) < made:
-            found = len(model["merges"])
-            why = f"merges are cut off: expected {made} for the vocabulary, found {found}"
-            raise VLMS.refusal(self._folder, why)
 
     def _find_chat_template(self) -> str:
         template, beside = self._tokenizer.chat_template, self._folder / "chat_template.json"
@@ -260,7 +250,7 @@ def _read_image_processor(folder: Path) -> _ImageProcessor:
     if document is None:
         path = folder / "preprocessor_config.json"
         document = VLMS.read_json(path, dict[str, JsonValue])
-    with quiet_transformers(), VLMS.foreign(path, "cannot be read"):
+    with VLMS.foreign(path, "cannot be read"):
         processor: Any = Qwen2VLImageProcessorPil.from_dict(document)
         kind = str(document.get("image_processor_type", "Qwen2VLImageProcessor"))
         processor.image_processor_type = kind.removesuffix("Fast").removesuffix("Pil")

@@ -47,11 +47,8 @@ def slots_of(
 
     `tokens` are the rows and columns of a view's image tokens. The vision tower has no final norm,
     so `norms` does not multiply its slots. Raises `VLMError` for a layer that the model lacks, for
-    a repeated entry, for text of the vision tower, and where no slot is left.
+    text of the vision tower, and where no slot is left.
     """
-    for name, values in (("norms", vlm.norms), ("pooling", vlm.pooling)):
-        if len(set(values)) < len(values):
-            raise VLMError(f"vlm.{name}: each may stand once, found {[*map(str, values)]}")
     if "vision" in vlm.layers and (text := [p for p in vlm.pooling if p in _WITH_TEXT]):
         raise VLMError(
             f"vlm.pooling {', '.join(map(str, text))}: the vision tower of vlm.layers sees no "
@@ -64,12 +61,6 @@ def slots_of(
         for pooling in vlm.pooling
         for slot in _slots_of(layer, norm, pooling, views, vlm.grid, tokens)
     )
-    cells = [(s.layer, s.norm, s.view, s.cell, s.grid) for s in slots if s.cell is not None]
-    if len({*cells}) < len(cells):
-        raise VLMError(
-            f"vlm.pooling: two of {', '.join(map(str, vlm.pooling))} give the same cells; `grid` "
-            f"has vlm.grid {vlm.grid[0]}x{vlm.grid[1]}, `tokens` {tokens[0]}x{tokens[1]}"
-        )
     if not slots:
         raise VLMError(
             f"vlm.pooling {list(vlm.pooling)} gives nothing without a view; add `mean` or `last`"

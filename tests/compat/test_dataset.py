@@ -148,7 +148,7 @@ class TestItems:
         for image in (first / "images" / "View2").iterdir():
             image.unlink()
         metadata = json.loads((first / "metadata.json").read_text())
-        metadata["camera_views"] = ["View1"]
+        metadata |= {"camera_views": ["View1"], "sensor_windows_count": 0}
         (first / "metadata.json").write_text(json.dumps(metadata))
         (first / "sensor_data.npz").unlink()
         data = UnifiedVLADataset(folder)

@@ -351,7 +351,7 @@ def only() -> Callable[..., Recording]:
 
     def open_one(folder: Path, views: Sequence[str] | None = None, **entries: Any) -> Recording:
         opened = open_recordings([Source(name="s", path=str(folder), **entries)], folder, views)
-        assert not opened.bad, opened.bad
+        assert not opened.bad, opened.bad[0].reason
         (recording,) = opened.recordings
         return recording
 

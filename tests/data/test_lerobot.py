@@ -12,22 +12,20 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.base.config import DataParams, Source
+from pipeline.base.config import Source
 from pipeline.base.digests import file_digest
 from pipeline.base.errors import RecordingError
 from pipeline.data import content_digest, open_recording, open_recordings
 from pipeline.data.lerobot import action_kind
 from pipeline.data.lerobot_rows import read_clock
-from pipeline.data.lerobot_writer import FilmedRows, write_filmed_v30
+from pipeline.data.lerobot_writer import LeRobotEpisode, write_data_set
 from pipeline.data.timeline import build_timeline
-from pipeline.look.recording.episode import view_episode
-from pipeline.look.recording.page import find_issues
 from tests.data.conftest import EPISODES_V3, VIEW_KEY, edit_v3, open_all
 
 VERSIONS = ["v2.0", "v2.1", "v3.0"]
 LENGTHS = (7, 5, 9)
 META_MEND = r".*Mend meta/, or convert the data set with the lerobot release that wrote it"
-FILE_MEND = r".*Copy the file again, or leave the episode out"
+FILE_MEND = r".*Copy or write the file again, or leave the episode out"
 
 refused = partial(pytest.raises, RecordingError)
 
@@ -129,9 +127,7 @@ def test_a_clock_of_which_one_time_is_off_stays_as_stored(spoilt):
     [
         (np.float32([0, 1, 2, 3, 2.5, 5, 6]), r"goes backwards at row 4"),
         (np.float32([0, 1, 2, 3, 3, 5, 6]), r"still at row 4: 3\.000000 s after 3\.000000 s"),
-        (np.arange(7) * np.float32(100), r"0\.1 s apart.*milliseconds.*Divide the column by 1000"),
-        (np.arange(7) * 10**8, r"0\.1 s apart.*nanoseconds.*Divide the column by 1e\+09"),
-        ([-1e308, *range(5), 1e308], r"expected seconds, found -1e\+308 in row 0" + FILE_MEND),
+        ([-1e308, *range(5), 1e308], r"timestamp -1e\+308 in row 0, expected seconds" + FILE_MEND),
     ],
 )
 def test_a_clock_that_is_none_is_named(seven, times, message):
@@ -184,11 +180,8 @@ def test_names_come_in_many_shapes(seven, names, read):
         ({"names": ["p"]}, "2 values a reading, but 1 names and 2 units"),
         ({"names": ["p", "p"]}, r"each channel name once, found \['p'\]"),
         ({"names": "ab"}, "names: expected .*found 'ab'"),
-        ({"names": [1, 2]}, r"names\.0: expected a valid string, found 1"),
         ({"shape": [2, 3]}, r"shape: expected a list .*1 item.*found \[2, 3\]"),
-        ({"shape": [True]}, r"shape\.0: expected a valid integer, found True"),
         ({"shape": [65_537]}, "at most 65,536 channels, found 65,537"),
-        ({"shape": [3]}, "2 values in row 0, but its feature has 3"),
     ],
 )
 def test_a_feature_is_judged_where_it_is_read(seven, entries, message):
@@ -206,10 +199,10 @@ def test_a_set_without_state_or_views_or_action(seven):
         open_all(seven(features={"action": None}))[0].action()
 
 
-@pytest.mark.parametrize(("column", "version"), [("action", "v2.1"), ("timestamp", "v3.0")])
-def test_a_missing_column_is_named(seven, column, version):
+@pytest.mark.parametrize("column", ["action", "timestamp"])
+def test_a_missing_column_is_named(seven, column):
     with refused(match=rf"\.parquet.*missing column '{column}'"):
-        open_all(seven(version, **{column: None}))[0].action()
+        open_all(seven(**{column: None}))[0].action()
 
 
 def test_numbers_in_a_plain_column_are_a_stream_of_one(seven):
@@ -224,26 +217,12 @@ def test_numbers_in_a_plain_column_are_a_stream_of_one(seven):
         ("observation.state", [[0.0, 1.0]] * 6 + [[0.0]], "1 values in row 6"),
         ("observation.state", [[0.0, 1.0]] * 6 + [None], "no value in row 6"),
         ("observation.state", [[0.0, 1.0]] * 6 + [[0.0, None]], "nan in row 6.*'b'"),
-        ("observation.state", [["0", "1"]] * 7, "expected numbers, found .*string"),
-        ("timestamp", [True] * 7, f"expected numbers, found 'bool{FILE_MEND}"),
         ("frame_index", [None] * 7, "expected numbers, found 'null"),
-        ("episode_index", pa.array(["a"] * 7).dictionary_encode(), "numbers, found 'dictionary<"),
     ],
 )
 def test_spoilt_rows_are_named(seven, column, cells, message):
     with refused(match=rf"episode_000000.*'{column}'.*{message}"):
         open_all(seven(**{column: cells}))[0].state()
-
-
-def test_an_episode_without_rows_is_named(seven, write):
-    root = seven()
-    path = root / "data/chunk-000/episode_000000.parquet"
-    pq.write_table(pq.ParquetFile(path).read().slice(0, 0), path)
-    write.jsonl(root / "meta/episodes.jsonl", [{"episode_index": 0, "tasks": [], "length": 0}])
-    recording = open_all(root)[0]
-    for read in (recording.state, recording.action, recording.cameras):
-        with refused(match=r"episode_000000\.parquet: has no row"):
-            read()
 
 
 def edit_episodes(root: Path, write, **columns) -> None:
@@ -277,14 +256,6 @@ def test_images_in_rows_are_read_lazily(tmp_path, write, version):
     indices = [0, 3, 3, 17, 39, 39]
     view.check(indices)
     assert shades(view.read(indices)) == [write.shade_of(12 + index) for index in indices]
-
-
-def test_grey_images_of_16_bits_in_rows_are_shown_in_eight(seven, write):
-    cells = [{"bytes": write.png(shade, grey_of_16_bits=True), "path": None} for shade in (30, 200)]
-    view = open_all(seven(image=True, **{VIEW_KEY: [*cells * 3, cells[0]]}))[0].cameras()["top"]
-    view.check([0, 1])
-    for frame, shade in zip(view.read([0, 1]), (30, 200), strict=True):
-        np.testing.assert_array_equal(frame, write.shaded(shade))
 
 
 def test_a_spoilt_image_in_a_row_is_named(seven, write):
@@ -324,7 +295,7 @@ def test_the_sidecar_is_the_sensor(root, truth):
     assert all(file in r.files() for file, r in zip(files, recordings, strict=True))
     for changes, message in (
         ({"names": ["fx"]}, "2 values a reading, but 1 names"),
-        ({"names": ["f\0x", "fy"]}, r"names': 0: expected a text to .*Copy the"),
+        ({"names": ["f\0x", "fy"]}, r"names': 0: expected a text to .*Copy or"),
         ({"timestamps": np.arange(29)}, "30 rows but 29 timestamps"),
     ):
         save(0, **{**clock, "values": truth.sensor[:30, :2], **changes})
@@ -332,20 +303,18 @@ def test_the_sidecar_is_the_sensor(root, truth):
             recordings[0].sensor()
 
 
-@pytest.mark.parametrize("kind", ["no such file", "a pipe"])
-@pytest.mark.parametrize("name", ["sensor", "state", "frames"])
+@pytest.mark.parametrize(("name", "kind"), [("sensor", "no such file"), ("state", "a pipe")])
 def test_a_sidecar_that_is_no_file_is_refused_not_absent(seven, name, kind):
     root = seven()
     path = root / name / "episode_000000.npz"
     path.parent.mkdir()
     os.mkfifo(path) if kind == "a pipe" else path.symlink_to("nowhere")
     recording = open_all(root)[0]
-    message = rf"{name}/episode_000000\.npz: .*{kind}.*Copy the file again"
+    message = rf"{name}/episode_000000\.npz: .*{kind}.*Copy or write the file again"
     with refused(match=message):
         content_digest(recording, file_digest)
-    if name != "frames":  # it belongs to images in rows, of which this data set has none
-        with refused(match=message):
-            getattr(recording, name)()
+    with refused(match=message):
+        getattr(recording, name)()
 
 
 def test_states_faster_than_the_rows_are_in_a_sidecar(root):
@@ -443,13 +412,6 @@ def test_episodes_whose_files_are_absent_are_listed(tmp_path, write):
         open_all(root)
 
 
-def test_shared_files_that_are_absent_take_their_episodes_with_them(tmp_path, write):
-    root = write.lerobot(tmp_path / "set", "v3.0", file_of=[0, 0, 1])
-    (root / f"videos/{VIEW_KEY}/chunk-000/file-000.mp4").unlink()
-    opened = open_recordings([Source(name="s", path=".")], root)
-    assert [r.id for r in opened.recordings] == ["episode_000002"] and len(opened.missing) == 2
-
-
 def test_swapped_data_files_are_refused(tmp_path, write):
     root = write.lerobot(tmp_path / "set", lengths=(7, 7, 7))
     first, other = (root / f"data/chunk-000/episode_00000{index}.parquet" for index in (0, 1))
@@ -479,23 +441,18 @@ def test_rows_that_were_taken_away_are_no_mistake(seven, columns):
 
 
 @pytest.mark.parametrize(
-    ("columns", "shared"),
+    "columns",
     [
-        ({f"videos/{VIEW_KEY}/file_index": [0, 0, 0]}, [0, 1, 2]),
-        ({f"videos/{VIEW_KEY}/file_index": [1, 0, 1]}, [0, 2]),
-        ({f"videos/{VIEW_KEY}/from_timestamp": [0.0, 0.6, 0.0]}, [0, 1]),
+        {f"videos/{VIEW_KEY}/file_index": [0, 0, 0]},
+        {f"videos/{VIEW_KEY}/file_index": [1, 0, 1]},
+        {f"videos/{VIEW_KEY}/from_timestamp": [0.0, 0.6, 0.0]},
     ],
 )
-def test_frames_that_meta_gives_to_two_episodes_are_refused(tmp_path, write, columns, shared):
+def test_frames_that_meta_gives_to_two_episodes_are_refused(tmp_path, write, columns):
     root = write.lerobot(tmp_path / "set", "v3.0", file_of=[0, 0, 1])
     edit_v3(root, **columns)
-    for index, recording in enumerate(open_all(root)):
-        for read in (recording.cameras, recording.identity):
-            if index not in shared:
-                read()
-                continue
-            with refused(match=rf"file-00\d\.mp4: .*to episode_00000{index} and to episode_"):
-                read()
+    with refused(match=r"meta/episodes: episode_.* and episode_.* have the same frames of .*mp4"):
+        open_all(root)
     assert [recording.cameras() for recording in open_all(root, [])] == [{}] * 3
 
 
@@ -525,23 +482,12 @@ def test_two_cameras_that_would_be_one_view_are_refused(seven):
 
 
 @pytest.mark.parametrize(
-    "entries",
-    [
-        {"info": {"is_depth_map": True}},
-        {"video_info": {"video.is_depth_map": True}},
-        {"info": None, "video_info": {"is_depth_map": 1}},
-    ],
+    "entries", [{"video_info": {"video.is_depth_map": True}}, {"info": {"is_depth_map": 1}}]
 )
-def test_a_depth_map_is_no_view(tmp_path, write, root, entries):
-    key, info = "observation.images.depth", root / "meta/info.json"
-    features = json.loads(info.read_text())["features"]
-    write.edit_json(info, features={**features, key: camera(**entries)})
+def test_a_depth_map_is_no_view(seven, entries):
+    root = seven(features={"observation.images.depth": camera(**entries)})
     for recording in open_all(root):
-        assert recording.depth_views() == ["depth"]
         assert recording.view_names() == list(recording.cameras()) == ["top"]
-    assert open_all(root, ["top"])[0].depth_views() == []
-    with refused(match=r"info\.json.*data\.views asks for depth.*is_depth_map"):
-        open_all(root, ["top", "depth"])
 
 
 def test_a_stale_file_index_is_seen_through(tmp_path, write):
@@ -554,13 +500,6 @@ def test_a_stale_file_index_is_seen_through(tmp_path, write):
     for recording, values in zip(recordings, good, strict=True):
         np.testing.assert_array_equal(recording.state().values, values)
     assert root / "data/chunk-000/file-001.parquet" in recordings[2].files()
-    assert [recording.nominal().mistakes for recording in recordings[:2]] == [(), ()]
-    params = DataParams(sources=(Source(name="s", path=str(root)),), action_hz=None)
-    issues = find_issues(view_episode(recordings[2], params, "rotvec"))
-    (issue,) = [issue for issue in issues if issue.kind == "wrong metadata"]
-    assert issue.episode == "episode_000002" and issue.severity == "warning"
-    listed, actual = (issue.message.index(f"chunk-000/file-00{file}.parquet") for file in (0, 1))
-    assert listed < actual < issue.message.index("Correct")
     (root / "data/chunk-000/file-001.parquet").unlink()
     with refused(match=r"file-000.*no row of episode 2, nor has any other file"):
         open_all(root)[2].state()
@@ -575,14 +514,7 @@ def test_episodes_name_their_groups(root, write):
 def test_row_counts_that_disagree_with_meta_are_named(root, write):
     edit_episodes(root, write, length=[8, 8, 8])
     with refused(match=r"\.parquet: 7 rows of episode 0.*says 8"):
-        open_all(root)[0].state()
-
-
-def test_timestamps_of_meta_that_disagree_with_the_rows_are_found_by_check(tmp_path, write):
-    root = write.lerobot(tmp_path / "set", "v3.0")
-    edit_v3(root, **{f"videos/{VIEW_KEY}/to_timestamp": [0.6, 1.2, 2.1]})
-    with refused(match="6 frames of view 'top' but 7 rows"):
-        open_all(root)[0].cameras()["top"].check([0])
+        open_all(root, [])[0].state()
 
 
 def test_a_truncated_parquet_is_named(tmp_path, write):
@@ -599,17 +531,8 @@ def test_a_truncated_parquet_is_named(tmp_path, write):
     ("file", "text", "message"),
     [
         ("info.json", "{", "info.json: cannot be read as JSON"),
-        ("info.json", "[]", "info.json: expected an object, found"),
-        ("info.json", '{"fps": 1' + "0" * 400 + "}", "fps: expected a finite number, found 1000"),
         ("episodes.jsonl", '{"episode_index": 0, "length": 7}\n{', "episodes.jsonl, line 2"),
-        ("episodes.jsonl", '{"length": 7}', "line 1.*episode_index"),
-        (
-            "episodes.jsonl",
-            '{"episode_index": 4, "length": 7, "tasks": "pick"}',
-            r"episodes\.jsonl, line 1: tasks: .*found 'pick'",
-        ),
         ("tasks.jsonl", '{"task": "pick"}', "tasks.jsonl, line 1.*task_index"),
-        ("tasks.jsonl", '{"task_index": 0, "task": 5}', "task: expected a valid string, found 5"),
         (
             "tasks.jsonl",
             '{"task_index": 7, "task": "a"}\n{"task_index": 7, "task": "b"}',
@@ -639,22 +562,12 @@ OUTSIDE = (
     ("changes", "message"),
     [
         ({"codebase_version": "v2.2"}, "codebase_version: .*v3.0', found 'v2.2'"),
-        ({"codebase_version": None}, "codebase_version: missing"),
         ({"fps": 0}, "fps: expected .*found 0"),
-        ({"fps": True}, "fps: expected a valid number, found True"),
-        ({"chunks_size": 0.5}, "chunks_size: expected .*found 0.5"),
-        ({"features": []}, r"features: expected .*found \[\]"),
         ({"video_path": None}, "video_path: missing, but features has videos"),
         ({"video_path": "{video_key.__class__}"}, "video_path: expected .*found"),
         *(({"data_path": path}, "data_path: expected .*found") for path in OUTSIDE.split(" ")),
-        (feature(units=[None]), r"features\.a\.units\.0: expected a valid string, found None"),
-        (feature(dtype=5), r"features\.a\.dtype: expected a valid string, found 5"),
         (feature(info={"is_depth_map": "some"}), r"a\.info\.is_depth_map: expected .*'some'"),
-        *(
-            (feature(key, dtype=dtype), "features: a camera cannot have the name")
-            for key in ("observation.images.a/b", "observation.images.", "a\\b", "..")
-            for dtype in ("video", "image")
-        ),
+        (feature("observation.images.a/b", dtype="image"), "a camera cannot have the name"),
     ],
 )
 def test_broken_info_is_named(seven, write, changes, message):
@@ -668,16 +581,10 @@ def test_broken_info_is_named(seven, write, changes, message):
     ("column", "cells", "message"),
     [
         ("data/file_index", None, r"data\.file_index: missing"),
-        ("episode_index", ["0", "1", "2"], r"episode_index: expected a valid integer, found '0'"),
         ("episode_index", [-1, 1, 2], "episode_index: expected greater .*found -1"),
-        ("length", [10**12, 5, 9], "length: expected less than 1000000000, found 1000000000000"),
         ("length", [None, 5, 9], "length: expected .*found None"),
-        ("data/chunk_index", [0.5, 0.0, 0.0], r"data\.chunk_index: expected .*found 0\.5"),
-        ("tasks", ["a", "b", "c"], "tasks: expected .*found 'a'"),
-        ("group", [True, False, True], "group.*found True"),
         (f"videos/{VIEW_KEY}/from_timestamp", [np.nan, 0.7, 1.2], r"from_timestamp: expected"),
         (f"videos/{VIEW_KEY}/to_timestamp", [1e308, 0.7, 1.2], r"to_timestamp: expected"),
-        (f"videos/{VIEW_KEY}/from_timestamp", [0.06, 0.7, 1.2], "the time of a frame at fps 10"),
     ],
 )
 def test_rows_of_meta_of_v3_are_checked(tmp_path, write, column, cells, message):
@@ -697,23 +604,19 @@ def test_files_of_episodes_are_all_read_and_none_is_refused(tmp_path, write):
     pq.write_table(pa.table({"task_index": [-1], "task": ["a"]}), tasks)
     with refused(match=rf"tasks\.parquet, row 0: task_index: expected .*found -1{META_MEND}"):
         open_all(root)
-    path.write_bytes(path.read_bytes()[:50])
-    with refused(match="cannot be read as parquet"):
-        open_all(root)
     path.unlink(), path.with_name("file-001.parquet").unlink()
     with refused(match="expected chunk-000/file-000"):
         open_all(root)
 
 
-@pytest.mark.parametrize("column", ["episode_index", "length", "data/chunk_index"])
-def test_whole_numbers_may_be_stored_as_floats(tmp_path, write, column):
+def test_whole_numbers_may_be_stored_as_floats(tmp_path, write, column="length"):
     root = write.lerobot(tmp_path / "set", "v3.0")
     cells = pq.ParquetFile(root / EPISODES_V3).read()[column]
     edit_v3(root, **{column: cells.cast(pa.float64()).to_pylist()})
     assert [len(recording.action().values) for recording in open_all(root)] == [7, 5, 9]
 
 
-@pytest.mark.parametrize("version", VERSIONS)
+@pytest.mark.parametrize("version", VERSIONS[1:])
 def test_what_info_says_of_an_episode_is_in_its_identity(tmp_path, write, version):
     root = write.lerobot(tmp_path / "set", version)
     path = root / "meta/info.json"
@@ -750,32 +653,21 @@ def test_adding_an_episode_leaves_the_files_of_the_others_alone(tmp_path, write)
         assert not any("meta" in path.parts for path in recording.files())
 
 
-def test_tables_that_unpack_to_more_than_the_limits_are_refused_unread(
-    tmp_path, write, seven, monkeypatch
-):
-    monkeypatch.setattr("pipeline.data.recording._ALWAYS_TAKEN", 2**16)
-    zeros, unpacked = (
-        np.zeros(100_000, np.int8),
-        r"parquet: expected at most .* raise limits\.ratio",
-    )
+def test_tables_that_unpack_to_more_than_the_limits_are_refused_unread(tmp_path, write, seven):
+    zeros = np.zeros(100_000, np.int8)
+    small, unpacked = {"array_bytes": 2**16}, r"parquet: expected at most .* raise limits\.array"
     root = write.lerobot(tmp_path / "v3", "v3.0", image=True)
     names = ("episode_index", "length", "data/chunk_index", "data/file_index")
     pq.write_table(pa.table(dict.fromkeys(names, zeros)), root / EPISODES_V3)
     with refused(match=unpacked):
-        open_all(root)
+        open_all(root, limits=small)
     root = seven()
     table = pa.table(dict.fromkeys(("episode_index", "timestamp"), zeros))
     pq.write_table(table, root / "data/chunk-000/episode_000000.parquet")
     with refused(match=unpacked):
-        open_all(root)[0].state()
+        open_all(root, limits=small)[0].state()
     with refused(match="100000 rows of episode 0, but meta/ says 7"):
-        open_all(root, limits={"ratio": 1e6})[0].state()
-
-
-def test_a_list_of_episodes_that_never_ends_is_refused(tmp_path, write, monkeypatch):
-    monkeypatch.setattr("pipeline.data.lerobot_meta._MOST_ROWS", 2)
-    with refused(match=r"meta: expected at most 2 episodes .*Split the data set"):
-        open_all(write.lerobot(tmp_path / "set"))
+        open_all(root)[0].state()
 
 
 def test_a_column_that_stands_twice_is_named(seven):
@@ -783,7 +675,7 @@ def test_a_column_that_stands_twice_is_named(seven):
     path = root / "data/chunk-000/episode_000000.parquet"
     table = pq.ParquetFile(path).read()
     pq.write_table(table.append_column("action", table["action"]), path)
-    with refused(match=r"one column 'action', found more\. Write the file again"):
+    with refused(match=r"one column 'action', found more\. Copy or write"):
         open_all(root)[0].action()
 
 
@@ -791,9 +683,7 @@ def test_a_column_that_stands_twice_is_named(seven):
     ("file", "version", "make"),
     [
         ("meta/episodes.jsonl", "v2.1", os.mkfifo),
-        ("meta/tasks.parquet", "v3.0", os.mkfifo),
         (EPISODES_V3, "v3.0", Path.mkdir),
-        ("data/chunk-000/episode_000000.parquet", "v2.1", os.mkfifo),
         ("data/chunk-000/file-000.parquet", "v3.0", Path.mkdir),
     ],
 )
@@ -813,9 +703,9 @@ def test_episodes_that_are_written_with_films_are_read_again(tmp_path):
         columns = {"action": rng.random((rows, 2)).astype(np.float32)}
         columns["timestamp"] = (np.arange(rows) / 10).astype(np.float32)
         film = np.full((rows, 48, 64, 3), shade, np.uint8)
-        filmed.append(FilmedRows(columns, {VIEW_KEY: film}))
+        filmed.append(LeRobotEpisode(columns, {VIEW_KEY: film}))
     features = {"action": {"names": ["dx", "dy"], "kind": "delta"}}
-    write_filmed_v30(tmp_path / "set", iter(filmed), features, "push the T", 10, "arm")
+    write_data_set(tmp_path / "set", iter(filmed), features, "push the T", 10, "arm")
     for recording, written, shade in zip(
         open_all(tmp_path / "set"), filmed, (40, 200), strict=True
     ):

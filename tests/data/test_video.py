@@ -60,22 +60,10 @@ def test_part_of_a_shared_file(path):
     assert all(np.array_equal(a, b) for a, b in zip(whole[20:30], part, strict=True))
 
 
-def test_frames_of_one_time_are_refused(tmp_path, write):
-    path = write.video(tmp_path / "a.mkv", SHADES, 3000)  # Matroska counts milliseconds
-    with pytest.raises(RecordingError, match=r"a\.mkv: frames \d and \d of view 'top' have the sa"):
-        clip(path, 36).check([0])
-
-
-def test_a_container_of_another_rate_pairs_by_number(tmp_path, write):
-    path = write.video(tmp_path / "a.mp4", SHADES[:15], fps=30)
-    assert shades(clip(path, 15).read(range(15))) == list(range(15))
-
-
 @pytest.mark.parametrize(
     ("rows", "first", "count", "message"),
     [
         (35, None, None, "36 frames of view 'top' but 35 rows"),
-        (37, None, None, "36 frames of view 'top' but 37 rows"),
         (10, 30, 10, "6 frames of view 'top' but 10 rows"),
         (10, 0, 11, "11 frames of view 'top' but 10 rows"),
         (10, 90, 10, "0 frames of view 'top' but 10 rows"),
@@ -140,14 +128,6 @@ def test_damage_that_the_decoder_conceals_spoils_the_frames_after_it(tmp_path, w
             attempt(clip(path, 36))
 
 
-def test_a_build_without_av1_says_so(tmp_path, write, monkeypatch):
-    needs("libsvtav1")
-    path = write.video(tmp_path / "a.mp4", [50] * 8, codec="libsvtav1")
-    monkeypatch.setattr(av, "codecs_available", {"h264"})
-    with pytest.raises(RecordingError, match=r"AV1.*pip install --upgrade av"):
-        clip(path, 8).check([0])
-
-
 def sound(path: Path) -> None:
     with av.open(str(path), "w") as container:
         stream = container.add_stream("aac", rate=44100)
@@ -175,7 +155,7 @@ def playlist(path: Path) -> None:
     path.write_text("ffconcat version 1.0\nfile neighbour.mp4\n")
 
 
-NONE = r"cannot be read as video \(MP4, Matroska, WebM or AVI\): Invalid \w+.*Copy the file again"
+NONE = r"cannot be read as video \(MP4, Matroska, WebM or AVI\): Invalid \w+.*Copy or write"
 
 
 @pytest.mark.parametrize(
@@ -183,15 +163,12 @@ NONE = r"cannot be read as video \(MP4, Matroska, WebM or AVI\): Invalid \w+.*Co
     [
         (playlist, NONE),
         (lambda path: path.write_bytes(b""), NONE),
-        (lambda path: path.write_bytes(b"no video " * 99), NONE),
-        (lambda path: Image.new("RGB", (9, 9)).save(path, "GIF"), NONE),
         (sound, "holds no video"),
-        (lambda path: None, "no such file"),
         (
             lambda path: mjpeg(path, 40),
             r"expected at most 1,000 pixels, found 1,600\. .*limits\.pixels",
         ),
-        (lambda path: mjpeg(path, 16, 40), "cannot be read as video.*Copy the file again"),
+        (lambda path: mjpeg(path, 16, 40), "cannot be read as video.*Copy or write the file again"),
     ],
 )
 def test_videos_are_of_few_kinds_and_within_limits(tmp_path, make, message):

@@ -83,7 +83,10 @@ def test_streams_and_views_may_be_absent(folder, write, only):
     (folder / "sensor_data.npz").unlink()
     for frame in (folder / "images" / "View2").iterdir():
         frame.unlink()
-    write.edit_json(folder / "metadata.json", camera_views=["View1"])
+    with pytest.raises(RecordingError, match=r"robot_states\.npz: 0 rows.*says 50"):
+        only(folder).state()
+    counts = dict.fromkeys(("robot_states_count", "sensor_windows_count"))
+    write.edit_json(folder / "metadata.json", camera_views=["View1"], **counts)
     recording = only(folder)
     assert recording.state() is None and recording.sensor() is None and recording.poses() is None
     assert list(recording.cameras()) == ["View1"]
@@ -114,11 +117,11 @@ def rewrite_states(**changes):
 @pytest.mark.parametrize(
     ("spoil", "message"),
     [
-        (rewrite_states(poses=np.zeros((49, 6))), "50 joints, 49 poses"),
+        (rewrite_states(robot_states=None, poses=np.zeros((49, 6))), r"joints and poses \(M, 6\)"),
         (rewrite_states(robot_states=None, poses=None), "no member 'poses'"),
         (rewrite_states(robot_states=np.zeros((50, 11))), r"12 values.*\(50, 11\)"),
         (rewrite_states(robot_states=None, joints=None, poses=None), "expected robot_states"),
-        (rewrite_states(joints=np.float32(1)), "'joints': expected rows of numbers, found .* 1"),
+        (rewrite_states(joints=np.float32(1)), "'joints': expected rows of numbers, found float32"),
         (rewrite_states(robot_states=np.full((50, 12), np.inf)), "inf in row 0.*joint_1"),
     ],
 )
@@ -150,7 +153,7 @@ def test_metadata_that_contradicts_the_arrays(folder, write, only, changes, stre
         ({"timestamps": np.array([0, 2.0, 1]), "data": np.zeros((3, 5, 1026))}, "at row 2"),
         ({"timestamps": np.float32([1e9, 1e9, 1e9]), "data": np.zeros((3, 5, 1026))}, "too coarse"),
         ({"data": np.zeros((3, 5, 1026))}, "no member 'timestamps'"),
-        ({"times": np.zeros(3)}, "expected timestamps or data, found times"),
+        ({"times": np.zeros(3)}, r"expected timestamps or data, found \['times'\]"),
     ],
 )
 def test_spoilt_windows_are_named(folder, write, only, members, message):
@@ -168,16 +171,11 @@ def test_unreadable_metadata_is_a_bad_episode(folder, text):
     assert "metadata.json" in bad.reason and (text or "no such file" in bad.reason)
 
 
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"camera_views": ["View1", "View7"]}, "camera_views has View7, and images/ no frame"),
-        ({"camera_frames_count": 5}, "camera_frames_count is 5, and images/ has 4"),
-    ],
-)
-def test_cameras_that_metadata_promises_must_be_there(folder, write, only, changes, message):
-    write.edit_json(folder / "metadata.json", **changes)
-    with pytest.raises(RecordingError, match=rf"metadata\.json: {message}"):
+def test_cameras_that_metadata_promises_must_be_there(folder, write, only):
+    write.edit_json(folder / "metadata.json", camera_views=["View1", "View7"])
+    with pytest.raises(
+        RecordingError, match=r"metadata\.json: camera_views has View7, and images/"
+    ):
         only(folder).cameras()
 
 
@@ -187,12 +185,13 @@ def test_a_sensor_rate_that_the_overlap_disproves_is_refused(
 ):
     folder = write.new(tmp_path / "T" / "e", truth, 65, 13)
     write.edit_json(folder / "metadata.json", sensor_hz=sensor_hz)
-    with pytest.raises(
-        RecordingError, match=rf"65\d(\.\d)? Hz.*sensor_hz.*{sensor_hz:g}; they must"
-    ):
+    with pytest.raises(RecordingError, match=rf"sensor_hz {sensor_hz:g}.* 65\d(\.\d)? would fit"):
         only(folder).sensor()
     write.edit_json(folder / "metadata.json", sensor_hz=630.0)
     assert only(folder).sensor() is not None
+    write.edit_json(folder / "metadata.json", sensor_hz=None)
+    with pytest.raises(RecordingError, match=r"metadata\.json: windows need a sensor_hz"):
+        only(folder).sensor()
 
 
 def cut(values: np.ndarray, time: np.ndarray, width: int, stride: int):
@@ -246,23 +245,6 @@ def test_a_gap_stays_a_gap(width, stride):
     assert np.diff(rebuilt_time).max() > 0.15
 
 
-def test_a_lost_window_whose_readings_stand_in_the_next_loses_nothing():
-    values, time = stream()
-    ends, data, stop = cut(values, time, 20, 5)
-    rebuilt_time, rebuilt = rebuild(np.delete(ends, 7), np.delete(data, 7, axis=0), 100.0, "x")
-    np.testing.assert_array_equal(rebuilt, values[:stop])
-    np.testing.assert_allclose(rebuilt_time, time[:stop], atol=1e-9)
-
-
-@pytest.mark.parametrize(("width", "stride"), [(20, 20), (20, 5)])
-def test_without_a_rate_the_window_ends_give_it(width, stride):
-    values, time = stream()
-    ends, data, stop = cut(values, time, width, stride)
-    rebuilt_time, rebuilt = rebuild(ends, data, None, "x")
-    np.testing.assert_array_equal(rebuilt, values[:stop])
-    np.testing.assert_allclose(rebuilt_time, time[:stop], atol=1e-9)
-
-
 def test_a_sensor_that_stands_still_is_cut_by_the_clock():
     time = np.arange(400) / 100
     ends, data, stop = cut(np.zeros((400, 3)), time, 20, 5)
@@ -275,8 +257,6 @@ def test_one_window_is_dated_back_from_its_end():
     time, values = rebuild(np.array([10.0]), np.ones((1, 5, 2)), 100.0, "x")
     np.testing.assert_allclose(time, [9.96, 9.97, 9.98, 9.99, 10.0])
     assert values.shape == (5, 2)
-    with pytest.raises(RecordingError, match="sensor_hz"):
-        rebuild(np.array([10.0]), np.ones((1, 5, 2)), None, "x")
 
 
 def test_overlap_by_the_clock_with_other_readings_is_a_contradiction():
@@ -285,22 +265,3 @@ def test_overlap_by_the_clock_with_other_readings_is_a_contradiction():
     data[9] = np.random.default_rng(1).normal(size=data[9].shape)
     with pytest.raises(RecordingError, match=r"file\.npz: windows 8 and 9 overlap"):
         rebuild(ends, data, 100.0, "file.npz")
-
-
-def test_nan_is_named_by_window_and_reading():
-    values, time = stream()
-    ends, data, _ = cut(values, time, 20, 5)
-    data = data.copy()
-    data[9, 4, 1] = np.nan
-    with pytest.raises(RecordingError, match="nan in window 9, reading 4, channel 1"):
-        rebuild(ends, data, 100.0, "x")
-
-
-@pytest.mark.parametrize("width", [2, 5])
-def test_one_shared_reading_contradicts_a_rate_too(width):
-    values, time = stream()
-    ends, data, stop = cut(values, time, width, width - 1)
-    with pytest.raises(RecordingError, match="must agree"):
-        rebuild(ends, data, 50.0, "x")
-    rebuilt_time, _ = rebuild(ends, data, 100.0, "x")
-    np.testing.assert_allclose(rebuilt_time, time[:stop], atol=1e-9)

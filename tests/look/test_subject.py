@@ -39,11 +39,6 @@ def test_a_path_that_means_nothing_is_told_what_it_is(tmp_path: Path) -> None:
     assert "matches nothing" in refused(tmp_path / "day*")
     (tmp_path / "run.zip").write_bytes(b"")
     assert f"found the file {tmp_path / 'run.zip'}" in refused(tmp_path / "run.zip")
-    (tmp_path / "umi.zarr").mkdir()
-    (tmp_path / "umi.zarr" / ".zgroup").write_text("{}")
-    (tmp_path / "demo.hdf5").write_bytes(b"")
-    for name, what in (("umi.zarr", "a zarr replay buffer"), ("demo.hdf5", "HDF5")):
-        assert f"looks like {what}" in refused(tmp_path / name)
 
 
 def test_a_store_is_known_by_its_content(tmp_path: Path, tiny_store: Callable[..., Path]) -> None:

@@ -187,34 +187,8 @@ def test_the_same_adapter_is_the_same_file(prepare, tmp_path):
     for file in ("adapter_config.json", "adapter_model.safetensors"):
         first, second = ((tmp_path / name / file).read_bytes() for name in ("one", "two"))
         assert first == second
-
-
-def test_tuning_goes_on_from_an_adapter(prepare, tmp_path):
-    whole, _, _ = prepare()
-    first = _live(whole, lora_r=4, lora_alpha=8)
-    _stir(first)
-    first.save(tmp_path / "first")
-
-    # A lower layer is read now: what the adapter has above it must not be lost.
-    frozen, rows, expected = prepare(layers=[1], adapter=str(tmp_path / "first"))
-    second = _live(frozen, lora_r=4, lora_alpha=8, lora_dropout=0.5, towers=["vision"])
-    torch.testing.assert_close(second.eval()(rows)[0], expected, atol=5e-5, rtol=1e-4)
-    assert all(".visual." in name for name in _learning(second))
-    assert (second.train()(rows)[0] - second(rows)[0]).abs().max() > 1e-3, "dropout is of tuning"
-    second.save(tmp_path / "second")
-    again = prepare(layers=[1], adapter=str(tmp_path / "second"))[2]
-    torch.testing.assert_close(again, expected)
-    saved = [load_file(tmp_path / n / "adapter_model.safetensors") for n in ("first", "second")]
-    assert saved[0].keys() == saved[1].keys()
-    assert all(torch.equal(saved[0][name], saved[1][name]) for name in saved[0])
-
-    with pytest.raises(VLMError, match=r"of lora_r 4, lora_alpha 8, but lora_r 16, lora_alpha 32"):
-        _live(frozen)
-    vision = _live(whole, lora_r=4, lora_alpha=8, towers=["vision"])
-    vision.save(tmp_path / "vision")
-    blind = prepare(adapter=str(tmp_path / "vision"))[0]
-    with pytest.raises(VLMError, match="nothing in the language tower"):
-        _live(blind, lora_r=4, lora_alpha=8)
+    with pytest.raises(VLMError, match="lora begins from a checkpoint without an adapter"):
+        _live(prepare(adapter=str(tmp_path / "one"))[0])
 
 
 def test_full_saves_a_complete_checkpoint(prepare, demo_checkpoint, tmp_path):

@@ -116,19 +116,11 @@ def _with_a_stranger(weights):
     return weights | {"visual.blocks.9.norm1.weight": torch.ones(128)}
 
 
-def _narrower(weights):
-    return weights | {"model.norm.weight": torch.ones(64)}
-
-
 @pytest.mark.parametrize(
     ("change", "message"),
     [
         (_without_a_layer, r"missing model\.language_model\.layers\.2\.mlp\.down_proj\.weight"),
         (_with_a_stranger, r"left over .*visual\.blocks\.9\.norm1\.weight"),
-        (
-            _narrower,
-            r"language_model\.norm\.weight of \[128\] by config\.json, found \[64\]\. Copy",
-        ),
     ],
 )
 def test_no_weight_is_ever_random(encode, copy, change, message, capfd):
@@ -177,15 +169,6 @@ raise SystemExit("code of the checkpoint ran")
         (
             "tokenizer_config.json",
             {"tokenizer_class": "Own", "auto_map": {"AutoTokenizer": ["evil.Own", "evil.Own"]}},
-        ),
-        (
-            "processor_config.json",
-            {
-                "image_processor": {
-                    "image_processor_type": "Own",
-                    "auto_map": {"AutoImageProcessor": "evil.Own"},
-                }
-            },
         ),
         ("processor_config.json", {"steps": [{"auto_map": {"AutoImageProcessor": "evil.Own"}}]}),
     ],
@@ -311,7 +294,6 @@ def test_an_adapter_that_does_not_fit_is_refused(encode, make_adapter, tmp_path)
         ("lora_alpha", float("nan"), "cannot be merged: ValueError: NaNs detected"),
         ("target_modules", "((", "does not fit the checkpoint .*unterminated"),
         ("megatron_config", {"a": 1}, "megatron_config: expected null"),
-        ("arrow_config", {"a": 1}, "arrow_config: expected null"),
     ],
 )
 def test_what_an_adapter_may_not_say(encode, make_adapter, tmp_path, key, value, told):
@@ -320,12 +302,6 @@ def test_what_an_adapter_may_not_say(encode, make_adapter, tmp_path, key, value,
     mend = r"Set vlm\.adapter to a LoRA adapter of this checkpoint"
     with pytest.raises(VLMError, match=rf"{folder}.*{told}.*{mend}"):
         encode(adapter=str(folder))
-
-
-def test_a_tensor_stands_once(encode, copy):
-    _rewrite(copy, lambda weights: weights | _newer_names({"model.norm.weight": torch.ones(128)}))
-    with pytest.raises(VLMError, match="a tensor stands there by two names"):
-        encode(checkpoint=str(copy))
 
 
 def test_a_config_of_other_weights_is_refused(encode, copy):

@@ -73,11 +73,8 @@ class MediaLimits(Section):
 
     pixels: int = Field(default=7680 * 4320, ge=1, le=10**12)
     """Most pixels (height x width) of one frame; by default 8K, which takes a second to decode."""
-    array_bytes: int = Field(default=16 * 2**30, ge=1, le=2**50)
+    array_bytes: int = Field(default=8 * 2**30, ge=1, le=2**50)
     """Most unpacked bytes of one array or table."""
-    ratio: float = Field(default=100.0, ge=1, le=1e6)
-    """Most unpacked bytes of a compressed array or table per byte of its file; up to 256 MiB are
-    always accepted."""
 
 
 class Source(Section):

@@ -17,11 +17,10 @@ import numpy as np
 from tqdm import tqdm
 
 from pipeline.base.config import Params
-from pipeline.base.errors import Issue, RecordingError, StoreMismatch
+from pipeline.base.errors import Issue, StoreMismatch
 from pipeline.base.text import Table, counted, duration
 from pipeline.data import Opened, Recording
 from pipeline.data.episode import Embodiment, common_embodiment
-from pipeline.data.recording import Nominal
 from pipeline.data.timeline import ActionRotation, choose_action_rotation, rate_notes
 from pipeline.look.page.blocks import Issues, Picture, Report, Section, Text, next_steps
 from pipeline.look.recording.cameras import camera_blocks, find_frame_issues
@@ -178,40 +177,20 @@ def _summarise(view: EpisodeView) -> RecordingSummary:
 def find_issues(view: EpisodeView) -> tuple[Issue, ...]:
     """The issues of this episode and of reading it: errors first, then by time."""
     issues = list(view.issues)
-    try:
-        nominal = view.recording.nominal()
-    except RecordingError as error:
-        nominal = Nominal()
-        # The same file may be the reason why a stream cannot be read.
-        if str(error) not in {issue.message for issue in issues}:
-            issues.append(view.issue("unreadable", "metadata", str(error)))
-    issues += [view.issue("wrong metadata", "", mistake) for mistake in nominal.mistakes]
-    issues += [*find_clock_issues(view), *_missing(view, nominal)]
+    issues += [*find_clock_issues(view), *_missing(view)]
     issues += [*find_channel_issues(view), *find_frame_issues(view)]
     issues.sort(key=lambda issue: (issue.severity != "error", issue.start_s or float("-inf")))
     return tuple(issues)
 
 
-def _missing(view: EpisodeView, nominal: Nominal) -> Iterator[Issue]:
-    """Streams, cameras and views that are missing, and depth maps, which are no views."""
-    unread = {name for issue in view.issues for name in issue.stream.split(", ")}
-    for name, entry in nominal.streams.items():
-        if name not in view.streams and name not in unread:
-            message = f"no file holds it, but {nominal.where} says {entry}: copy the file, too"
-            yield view.issue("missing", name, message)
-    for name in view.recording.depth_views():
-        message = "a depth map by the metadata, no picture: it is no view, the VLM does not see it"
-        yield view.issue("depth view", f"view {name}", message)
-    if "cameras" in unread:
+def _missing(view: EpisodeView) -> Iterator[Issue]:
+    """An episode without a picture."""
+    if view.cameras or any("cameras" in issue.stream.split(", ") for issue in view.issues):
         return
-    # These include the views that `data.views` leaves out.
-    recorded, empty = view.recording.all_views(), view.recording.empty_views()
-    if not view.cameras:
-        left_out = f"; data.views leaves out {', '.join(recorded)}" if recorded else ""
-        message = f"no camera has a frame{left_out}: the VLM would see no picture"
-        yield view.issue("missing", "cameras", message)
-    for name in empty:
-        yield view.issue("missing", f"view {name}", "its folder is there and holds no frame")
+    recorded = view.recording.all_views()  # with those that `data.views` leaves out
+    left_out = f"; data.views leaves out {', '.join(recorded)}" if recorded else ""
+    message = f"no camera has a frame{left_out}: the VLM would see no picture"
+    yield view.issue("missing", "cameras", message)
 
 
 def _warn_of_missing(summaries: Sequence[RecordingSummary]) -> None:

@@ -7,6 +7,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 
 from pipeline.base.config import Params, Source, load_params
@@ -190,9 +192,10 @@ def test_episodes_that_cannot_be_opened(healthy: Path, tmp_path: Path) -> None:
 
 def test_episodes_that_meta_lists_and_are_not_there(healthy: Path, tmp_path: Path) -> None:
     root = Path(shutil.copytree(healthy / "lerobot", tmp_path / "lerobot"))
-    lines = root / "meta/episodes.jsonl"
-    line = lines.read_text()
-    lines.write_text(line + line.replace('"episode_index": 0', '"episode_index": 1'))
+    path = root / "meta/episodes/chunk-000/file-000.parquet"
+    (row,) = pq.ParquetFile(path).read().to_pylist()
+    other = {name: 1 if name.endswith("/file_index") else value for name, value in row.items()}
+    pq.write_table(pa.Table.from_pylist([row, {**other, "episode_index": 1}]), path)
     (issue,) = survey(Source(name="s", path=str(root))).issues
     assert (issue.kind, issue.severity, issue.source) == ("missing", "warning", "s")
     assert "episode_000001" in issue.message
