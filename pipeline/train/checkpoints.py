@@ -12,11 +12,8 @@ from pipeline.base.border import Document, Text
 from pipeline.base.differences import describe, differences
 from pipeline.base.errors import CheckpointMismatch
 from pipeline.base.files import read_document, read_tensors, write_tensors, write_with_digest
-from pipeline.policy.checkpoint import Sha256, load_policy
-from pipeline.policy.normalization import Normalization
-from pipeline.policy.shape import PolicyShape
-from pipeline.train.process_group import ProcessGroup
-from pipeline.train.run import TRAINER_DOCUMENT, TRAINER_WEIGHTS, TrainingRun
+from pipeline.policy.checkpoint import Sha256
+from pipeline.train.run import TRAINER_DOCUMENT, TRAINER_WEIGHTS
 
 
 class TrainerState(Document):
@@ -78,21 +75,3 @@ def load_weights(
         )
     for name, parameter in parameters.items():
         parameter.copy_(tensors[name])
-
-
-def read_last(
-    run: TrainingRun, processes: ProcessGroup
-) -> tuple[Normalization, PolicyShape, TrainerState, dict[str, Tensor]]:
-    """The state to resume from, read on rank 0 and sent to the other processes.
-
-    Raises `CheckpointIncomplete` or `CheckpointMismatch`.
-    """
-    tensors: dict[str, Tensor] = {}
-
-    def read() -> tuple[Normalization, PolicyShape, TrainerState]:
-        checkpoint = load_policy(run.last)
-        state, own = read_trainer(run.last)
-        tensors.update(own)  # sent one by one, not pickled with the rest
-        return checkpoint.normalization, checkpoint.shape, state
-
-    return *processes.shared(read), processes.tensors(tensors)

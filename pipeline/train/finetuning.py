@@ -35,7 +35,6 @@ from pipeline.train.finetuning_rows import (
     find_recordings,
     known_digests,
 )
-from pipeline.train.process_group import ProcessGroup
 from pipeline.vlm.feature_spec import FeatureSpec, feature_spec
 from pipeline.vlm.live import LiveVLM
 from pipeline.vlm.preparation import Preparer
@@ -56,15 +55,9 @@ class ModelFeatureSource(FeatureSource):
         """
         super().__init__(store)
         recordings = find_recordings(store, params)
-
-        def checked() -> FeatureSpec:
-            with known_digests(store) as digests:
-                spec = check_spec(store, params, digests)
-                check_recordings(store, recordings, digests)
-            return spec
-
-        # Once for all processes: they would read the same files.
-        self._spec = ProcessGroup.current().shared(checked)
+        with known_digests(store) as digests:
+            self._spec = check_spec(store, params, digests)
+            check_recordings(store, recordings, digests)
         self._vlm, self._finetune = params.vlm, params.finetune
         self._device = device
         self._rows = LiveRows(store, recordings, Preparer(params.vlm, self._spec))

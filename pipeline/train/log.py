@@ -28,7 +28,6 @@ from pipeline.base.files import (
     fresh,
     refuse_foreign,
 )
-from pipeline.train.process_group import ProcessGroup
 from pipeline.train.progress import Pace
 
 FINISH_TIMEOUT_S = 120.0
@@ -309,20 +308,14 @@ class TrainingLog(AbstractContextManager["TrainingLog"]):
 
 @contextmanager
 def open_log(
-    params: TrainHeadParams, resumed: bool, earlier: Iterable[Row], processes: ProcessGroup
-) -> Generator[TrainingLog | None]:
-    """The log with the loggers of `params` on rank 0, which prints where to look; None elsewhere.
+    params: TrainHeadParams, resumed: bool, earlier: Iterable[Row]
+) -> Generator[TrainingLog]:
+    """The log with the loggers of `params`; prints where to look.
 
-    If it cannot begin, all processes end. Raises `ConfigError` or `DiskFull`.
+    Raises `ConfigError` or `DiskFull`.
     """
-    opened: list[TrainingLog] = []
-    with ExitStack() as stack:
-
-        def begin() -> None:
-            with disk_full_named(params.logs):
-                loggers = open_loggers(params, resumed)
-            opened.append(stack.enter_context(TrainingLog(params.logs, loggers, earlier)))
-            processes.say(*(logger.note for logger in loggers))
-
-        processes.shared(begin)
-        yield opened[0] if opened else None
+    with disk_full_named(params.logs):
+        loggers = open_loggers(params, resumed)
+    with TrainingLog(params.logs, loggers, earlier) as log:
+        print(*(logger.note for logger in loggers), sep="\n")
+        yield log

@@ -38,7 +38,7 @@ class Pace(NamedTuple):
 
 
 class Progress(AbstractContextManager["Progress"]):
-    """Counts steps on stderr with a bar, or a line a minute; only one process shows it.
+    """Counts steps on stderr with a bar, or a line a minute.
 
     It also measures the pace of the steps and the wait for data; evaluations and checkpoints do not
     count.
@@ -50,13 +50,11 @@ class Progress(AbstractContextManager["Progress"]):
         device: torch.device,
         steps: range,
         trained_s: float = 0.0,
-        shown: bool = True,
     ) -> None:
         # None: shown where stderr is a terminal.
         self._bar: tqdm[NoReturn] = tqdm(
-            initial=steps.start, total=steps.stop, unit="step", disable=None if shown else True
+            initial=steps.start, total=steps.stop, unit="step", disable=None
         )
-        self._writes_lines = shown and self._bar.disable
         self._feed, self._device, self._step, self._total = feed, device, steps.start, steps.stop
         self._last_reading = self._step, trained_s, feed.waited_s
         self._before = trained_s
@@ -86,7 +84,7 @@ class Progress(AbstractContextManager["Progress"]):
             mem=f"{pace.peak_memory / 2**30:.1f}G",
         )
         now = time.perf_counter()
-        if self._writes_lines and now - self._last_line >= EVERY_S:
+        if self._bar.disable and now - self._last_line >= EVERY_S:
             self._last_line = now
             left = duration((self._total - self._step) / pace.steps_per_s)
             print(

@@ -63,7 +63,6 @@ identity, so that no run is resumed by code with other numbers."""
 FREE_PARAMS = {
     "anew",
     "device",
-    "feed",
     "check_store",
     "output",
     "logs",
@@ -74,7 +73,7 @@ FREE_PARAMS = {
     "grad_accumulation",
 }
 """Params that may change between a stop and the next start: they decide no number of the run.
-`grad_accumulation` times the number of processes is `parts`, which is compared instead."""
+`grad_accumulation` is compared as `parts`."""
 NOTHING: Mapping[str, Any] = MappingProxyType({})
 
 
@@ -218,10 +217,9 @@ RUN_FOLDER = OutputKind("a training run", _is_run)
 def finished_run(params: TrainHeadParams, path: Path) -> TrainingRun | None:
     """The run of these params on the store at `path` if it is finished, as `open_run` gives it.
 
-    None where it is not, and where several processes train together. Imports no torch.
+    None where it is not. Imports no torch.
     """
-    together = int(os.environ.get("WORLD_SIZE", "1")) > 1
-    if together or params.anew or not (params.output / RUN).exists():
+    if params.anew or not (params.output / RUN).exists():
         return None
     with build_lock(params.output):
         run = open_run(params, FeatureStore.open(path))
@@ -266,7 +264,7 @@ def run_identity(
     decides = {
         "trainer_version": TRAINER_VERSION,
         "train_head": params.model_dump(mode="json", exclude=FREE_PARAMS),
-        "parts": int(os.environ.get("WORLD_SIZE", "1")) * params.grad_accumulation,
+        "parts": params.grad_accumulation,
         "front": dict(extra_identity),
         "recordings": recordings_of(store),
     }

@@ -71,10 +71,10 @@ def test_a_signal_ends_the_step_and_saves_once(store, params, trainer, undisturb
     real, save = Trainer._train_step, Trainer._save_last
     saved: list[int] = []
 
-    def signalled(self: Trainer, *rest: Any) -> bool:
+    def signalled(self: Trainer, *rest: Any) -> None:
         if self.step == 12:
             os.kill(os.getpid(), signal.SIGTERM)
-        return real(self, *rest)
+        real(self, *rest)
 
     def counted(self: Trainer, *rest: Any) -> None:
         saved.append(self.step)

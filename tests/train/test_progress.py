@@ -79,7 +79,7 @@ def test_pauses_are_not_counted(monkeypatch):
     now = [100.0]
     monkeypatch.setattr(time, "perf_counter", lambda: now[0])
     feed = Waiting()
-    progress = Progress(feed, CPU, range(10, 100), trained_s=50.0, shown=False)
+    progress = Progress(feed, CPU, range(10, 100), trained_s=50.0)
     now[0] += 4
     with progress.paused():
         now[0] += 1000

@@ -27,10 +27,10 @@ def runs(store, params_below, trainer, tmp_path_factory):
     stopped = trainer(store, params_below(folder, output=folder / "stopped"))
     step = stopped._train_step
 
-    def killed(*rest: Any) -> bool:
+    def killed(*rest: Any) -> None:
         if stopped.step == 5:
             raise InterruptedError
-        return step(*rest)
+        step(*rest)
 
     stopped._train_step = killed
     with pytest.raises(InterruptedError):
@@ -56,6 +56,8 @@ def test_a_finished_run_is_left_alone(store, params, finished):
     assert len(open_run(params(), store).notes) == 1
     run = open_run(params(device="cpu", logs="elsewhere", checkpoint_every=1), store)
     assert run.status == "finished"
+    assert open_run(params(), store, {"adapter": "another"}).status == "new"
+    assert open_run(params(grad_accumulation=2), store).status == "new"
     assert not leftover.exists()
 
 

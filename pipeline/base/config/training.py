@@ -239,9 +239,9 @@ class TrainHeadParams(Section):
     """After an episode's end, train the policy to stand still (zero deltas and velocities, the last
     absolute action). Otherwise those steps of the chunk are left out of the loss."""
     batch_size: int = Field(default=64, ge=1, le=2**16)
-    """Ticks per step, over all accumulated parts and all processes."""
+    """Ticks per step, over all accumulated parts."""
     grad_accumulation: int = Field(default=1, ge=1, le=2**16)
-    """Parts of a step's ticks that each process computes one after the other."""
+    """Parts of a step's ticks that are computed one after the other."""
     max_steps: int = Field(default=500, ge=1, le=10**9)
     """Steps of the run; the learning rate's decay ends there."""
     lr_schedule: Literal["cosine", "trapezoid", "constant"] = "cosine"
@@ -291,9 +291,6 @@ class TrainHeadParams(Section):
     """Seed of weights, order and dropout."""
     device: str = "auto"
     """auto, cpu, cuda or cuda:N."""
-    feed: Literal["auto", "mapped", "device"] = "auto"
-    """How batches are made. mapped: gathered from the mapped store. device: gathered on the device,
-    which holds the streams that fit. `auto` chooses and prints why."""
     check_store: bool = True
     """Read the whole store once before training or tuning, and refuse a chunk that does not give
     its checksum; false skips this, where it takes too long."""
