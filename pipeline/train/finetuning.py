@@ -154,7 +154,7 @@ class ModelFeatureSource(FeatureSource):
 
 
 def head_params(params: Params) -> TrainHeadParams:
-    """`train_head` with the values of `finetune` in place of its own, and nothing compiled.
+    """`train_head` with the values of `finetune` in place of its own.
 
     Raises `ConfigError` where nothing of the model would learn, the policy would not see it, or
     would see more than one row.
@@ -175,8 +175,7 @@ def head_params(params: Params) -> TrainHeadParams:
             f"train_head.feature_history {params.train_head.feature_history}: the model is tuned "
             "on one row a tick. Set it to 1 for stages.finetune."
         )
-    # `finetune.lr` is the model's; rows have many shapes, which torch.compile cannot take.
-    kept = {"lr": params.train_head.lr, "compile": False}
+    kept = {"lr": params.train_head.lr}  # `finetune.lr` is the model's
     shared = TrainHeadParams.model_fields.keys() & FinetuneParams.model_fields.keys()
     changes = {name: getattr(params.finetune, name) for name in shared} | kept
     return params.train_head.model_copy(update=changes)

@@ -6,6 +6,7 @@ Weights & Biases, which hold clock times, lie beside it.
 
 import json
 import math
+import os
 from collections.abc import Generator, Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from importlib import import_module
@@ -182,7 +183,7 @@ class WandB:
         )
         try:
             self._run: Any = wandb.init(
-                project=params.wandb_project,
+                project=os.environ.get("WANDB_PROJECT", "vla-feature-cache"),
                 dir=str(folder),
                 id=_run_id(folder / "id", resumed),
                 name=params.output.name,

@@ -11,7 +11,6 @@ from pathlib import Path
 from types import FrameType
 
 import torch
-from jaxtyping import Bool, Float
 from torch import Tensor
 from tqdm import tqdm
 
@@ -21,7 +20,6 @@ from pipeline.base.files import sync
 from pipeline.base.machine import resolve_device, use_bfloat16
 from pipeline.base.text import duration, size
 from pipeline.policy.checkpoint import PolicyCheckpoint, load_policy, save_policy
-from pipeline.policy.observation import moving_channels
 from pipeline.policy.policy import Policy, Trainable, describe_cost
 from pipeline.store import Batch, FeatureStore, check_trailers
 from pipeline.train.batches import BatchIndices, FeatureSource, Windows, evenly
@@ -29,10 +27,8 @@ from pipeline.train.checkpoints import load_weights, of_kind, read_trainer, writ
 from pipeline.train.log import History, Row, TrainingLog, check_loggers, open_log
 from pipeline.train.optimizer import (
     WeightAverage,
-    compiled,
     make_optimizer,
     optimizer_tensors,
-    peak_rates,
     restore_optimizer,
     schedule,
     trainable,
@@ -115,13 +111,9 @@ class Trainer:
         self.module = self.source.attach(policy).to(self.device).train()
         self.learning = trainable(self.module)
         """The parameters that learn, by name; the others are neither averaged nor saved."""
-        rates = peak_rates(self.module, self.source, params)
-        self.optimizer = make_optimizer(self.module, params, rates)
+        self.optimizer = make_optimizer(self.module, params, self.source.parameter_lr)
         self.average = WeightAverage(self.module, params.ema_decay)
         self._bfloat16 = use_bfloat16(params.amp, self.device)
-        moves = moving_channels(self.store.streams["action"])
-        self._moves = torch.tensor(moves, device=self.device)
-        self._compiled = compiled(self.module.loss, self.device) if params.compile else None
 
     @property
     def policy(self) -> Policy:
@@ -185,9 +177,7 @@ class Trainer:
         precision = "bfloat16 autocast" if self._bfloat16 else "float32"
         return [
             *lines,
-            f"device {self.device}, {precision}"
-            f"{', compiled' if self.params.compile else ''}; "
-            f"steps {self.step} to {self.params.max_steps}",
+            f"device {self.device}, {precision}; steps {self.step} to {self.params.max_steps}",
             *self.source.summary(),
             *describe_data(self.store, self.shape, self.params, self.split),
         ]
@@ -223,12 +213,8 @@ class Trainer:
         assert isinstance(part, StepPart), "a feed hands back the entries of its plan"
         # A part's dropout and sampled noise must not depend on the parts before it.
         torch.manual_seed(part.seed)
-        action, valid = batch.action, batch.action_valid
-        if self.params.terminal_stop:
-            action, valid = stand_still(action, valid, self._moves)
-        loss_of = self._compiled or self.module.loss
         with torch.autocast(self.device.type, torch.bfloat16, enabled=self._bfloat16):
-            loss, parts = loss_of(batch, action, valid)
+            loss, parts = self.module.loss(batch, batch.action, batch.action_valid)
         loss = loss * part.share
         loss.backward()
         return {"loss": loss.detach()} | {name: part.share * v for name, v in parts.items()}
@@ -272,7 +258,6 @@ class Trainer:
             ticks,
             self.windows,
             self.params.batch_size,
-            samples=self.params.eval_samples,
             feed=lambda plan: self.source.feed(plan, self.windows, self.device),
         )
         comparison = compare(predictions, {}, action_space(self.store, self.normalization))
@@ -345,19 +330,6 @@ class Trainer:
             write_state(temporary)
 
         save_policy(folder, checkpoint, beside=write_beside)
-
-
-def stand_still(
-    action: Float[Tensor, "batch horizon action"],
-    valid: Bool[Tensor, "batch horizon"],
-    moves: Bool[Tensor, " action"],
-) -> tuple[Float[Tensor, "batch horizon action"], Bool[Tensor, "batch horizon"]]:
-    """The chunks with a standstill beyond the episode's end, and their mask: every step is valid.
-
-    There, channels that `moves` marks (deltas and velocities) become 0. Positions, such as a
-    gripper's, repeat the last one, as in the store.
-    """
-    return action.masked_fill(~valid.unsqueeze(-1) & moves, 0.0), torch.ones_like(valid)
 
 
 def train(

@@ -67,7 +67,6 @@ FREE_PARAMS = {
     "output",
     "logs",
     "loggers",
-    "wandb_project",
     "checkpoint_every",
     "store",
     "grad_accumulation",

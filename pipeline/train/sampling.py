@@ -181,10 +181,8 @@ class Plan:
         late = np.random.default_rng((seed, step, *_LAGS))
         feature_lag = late.integers(self._params.feature_lag + 1, size=len(ticks))
         sensor_lag_s = late.uniform(0, self._params.sensor_lag_s, len(ticks))
-        # Only chunk steps before the episode's end count; with terminal_stop all do.
-        counts = np.full(len(ticks), self._params.horizon)
-        if not self._params.terminal_stop:
-            counts = np.minimum(counts, self._ends[ticks] - ticks)
+        # Only chunk steps before the episode's end count.
+        counts = np.minimum(self._params.horizon, self._ends[ticks] - ticks)
         cuts = np.array_split(np.arange(len(ticks)), self._params.grad_accumulation)
         return [
             StepPart(

@@ -45,11 +45,6 @@ def test_seeds_differ_by_step_and_part(plan):
     assert {part.seed for part in plan(grad_accumulation=4, seed=1).step(0)}.isdisjoint(seeds)
 
 
-def test_with_a_terminal_stop_every_step_counts(plan):
-    for part in plan(grad_accumulation=4, terminal_stop=True, horizon=20).step(3):
-        assert part.share == pytest.approx(1 / 4)
-
-
 def test_fewer_ticks_than_parts_are_refused(store, params, plan):
     made = params(batch_size=7, grad_accumulation=8)
     split = split_by_episode(store, made.split, made.horizon)

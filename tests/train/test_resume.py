@@ -35,7 +35,6 @@ def test_every_step_can_be_gone_on_from(store, params, trainer, tmp_path, monkey
         "eval_every": 2,
         "checkpoint_every": 1,
         "drop_sensor": 0.3,
-        "sensor_lr": 1e-3,
         "diffusion": {"sampling_steps": 2},
         "flow_matching": {"sampling_steps": 2},
     }
