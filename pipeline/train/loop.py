@@ -9,21 +9,24 @@ from functools import partial
 from itertools import islice
 from pathlib import Path
 from types import FrameType
+from typing import Annotated, Any
 
 import torch
-from torch import Tensor
+from pydantic import Field
+from torch import Tensor, nn
 from tqdm import tqdm
 
+from pipeline.base.border import Document, Text
 from pipeline.base.config import TrainHeadParams
-from pipeline.base.errors import ConfigError, NumericsError
-from pipeline.base.files import sync
+from pipeline.base.differences import describe, differences
+from pipeline.base.errors import CheckpointMismatch, ConfigError, NumericsError
+from pipeline.base.files import read_document, read_tensors, sync, write_tensors, write_with_digest
 from pipeline.base.machine import resolve_device, use_bfloat16
 from pipeline.base.text import duration, size
-from pipeline.policy.checkpoint import PolicyCheckpoint, load_policy, save_policy
+from pipeline.policy.checkpoint import PolicyCheckpoint, Sha256, load_policy, save_policy
 from pipeline.policy.policy import Policy, Trainable, describe_cost
 from pipeline.store import Batch, FeatureStore, check_trailers
 from pipeline.train.batches import BatchIndices, FeatureSource, Windows, evenly
-from pipeline.train.checkpoints import load_weights, of_kind, read_trainer, write_trainer
 from pipeline.train.log import History, Row, TrainingLog, check_loggers, open_log
 from pipeline.train.optimizer import (
     WeightAverage,
@@ -35,7 +38,14 @@ from pipeline.train.optimizer import (
 )
 from pipeline.train.predictions import predict
 from pipeline.train.progress import Progress, describe_data, peak_memory_bytes
-from pipeline.train.run import TrainingRun, open_run, policy_shape, run_lock
+from pipeline.train.run import (
+    TRAINER_DOCUMENT,
+    TRAINER_WEIGHTS,
+    TrainingRun,
+    open_run,
+    policy_shape,
+    run_lock,
+)
 from pipeline.train.sampling import Plan, StepPart
 from pipeline.train.scores import action_space, compare
 from pipeline.train.split import Split, split_by_episode
@@ -223,10 +233,8 @@ class Trainer:
         self._check_finite()
         means = self.history.mean((self.step - 1) // LOG_EVERY * LOG_EVERY, self.step)
         rate = self.params.lr * schedule(self.step - 1, self.params)
-        pace = progress.read()
         log.write(self.step, {f"train/{k}": v for k, v in means.items()} | {"lr": rate})
-        log.write_speed(self.step, pace)
-        progress.show(pace, means["loss"], rate)
+        progress.show(means["loss"], rate)
 
     def _evaluate(self, log: TrainingLog, progress: Progress) -> None:
         """Evaluate the averaged weights; save them where they are the best so far."""
@@ -412,3 +420,64 @@ def deferred_interrupt() -> Generator[Callable[[], bool]]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
+
+
+class TrainerState(Document):
+    """A run after `step` steps, as in `trainer.json`.
+
+    It has no random state and no schedule state: both follow from the seed and the step.
+    """
+
+    step: Annotated[int, Field(ge=0)]
+    columns: tuple[Text, ...]
+    """Column names of the history."""
+    best_error: float | None
+    stalled: Annotated[int, Field(ge=0)]
+    """Evaluations since the best one."""
+    trained_s: Annotated[float, Field(ge=0)]
+    """Seconds of training so far, over all starts."""
+    rows: tuple[tuple[int, dict[Text, float]], ...]
+    weights_sha256: Sha256
+
+
+def write_trainer(folder: Path, state: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> None:
+    """Write the two files of a trainer's state into an existing folder.
+
+    `state` has the fields of `TrainerState` except the digest. `tensors` are the trainable
+    parameters (`weights:<name in the trained module>`), their moving averages (`average:`), the
+    optimizer's state (`optimizer:`), and a row for every step so far (`history:`).
+    """
+    digest = write_tensors(folder / TRAINER_WEIGHTS, tensors)
+    write_with_digest(folder / TRAINER_DOCUMENT, {**state, "weights_sha256": digest})
+
+
+def read_trainer(folder: Path) -> tuple[TrainerState, dict[str, Tensor]]:
+    """The state at `folder`. Raises `CheckpointIncomplete` where a file is missing or damaged."""
+    state, _ = read_document(folder / TRAINER_DOCUMENT, TrainerState)
+    return state, read_tensors(folder / TRAINER_WEIGHTS, state.weights_sha256)
+
+
+def of_kind(tensors: Mapping[str, Tensor], kind: str) -> dict[str, Tensor]:
+    """The tensors of one kind, by name."""
+    kind += ":"
+    return {k.removeprefix(kind): value for k, value in tensors.items() if k.startswith(kind)}
+
+
+@torch.no_grad()
+def load_weights(
+    parameters: Mapping[str, nn.Parameter], tensors: Mapping[str, Tensor], place: Path
+) -> None:
+    """Copy the tensors into the parameters of the same names.
+
+    Raises `CheckpointMismatch` where names or shapes differ.
+    """
+    wanted = {name: tuple(value.shape) for name, value in parameters.items()}
+    stored = {name: tuple(value.shape) for name, value in tensors.items()}
+    if differing := describe(differences(stored, wanted)):
+        raise CheckpointMismatch(
+            f"{place}: expected what learns in this run, {len(wanted)} parameters; {differing[0]} "
+            f"(the checkpoint -> the run). Remove {place} to begin anew, or use the version of "
+            "this code that wrote it."
+        )
+    for name, parameter in parameters.items():
+        parameter.copy_(tensors[name])

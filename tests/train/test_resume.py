@@ -7,8 +7,7 @@ import pytest
 import torch
 
 from pipeline.base.errors import CheckpointMismatch
-from pipeline.train.checkpoints import load_weights
-from pipeline.train.loop import Trainer
+from pipeline.train.loop import Trainer, load_weights
 
 STEPS = 4
 
