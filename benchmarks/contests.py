@@ -31,10 +31,9 @@ def row_race(
     drawn = draws(sizes["draws"], count, 0, len(mapped))
     out = torch.zeros((count, *mapped.shape[1:]), dtype=mapped.dtype)
     batch = store.gatherer.empty_batch(count, 1, 1, 1).touch()
-    but = WIDE.keys() - {"features"}
 
     def ours(rows: Index) -> None:
-        store.gatherer.copy(Selection({"features": rows}, {}), batch, but)
+        store.gatherer.copy(Selection({"features": rows}, {}), batch)
 
     fast: dict[str, Work] = {
         "memcpy": each(drawn, lambda rows: out.copy_(ram[rows[0] % (len(ram) - count) :][:count])),
@@ -143,7 +142,11 @@ def warm(store: FeatureStore) -> None:
 
 def wide_rows(store: FeatureStore, ticks: Index, wanted: tuple[int, int, int]) -> dict[str, Index]:
     """The rows that the wide fields of a batch without padding are made of."""
-    _, selection = store.select(ticks, (*wanted, None, None, 1), (0, 0.0, 0.0), None, None)
+    batch, any_age = (
+        store.gatherer.empty_batch(len(ticks), *wanted),
+        {"sensor": None, "state": None},
+    )
+    selection = store.gatherer.select(batch, ticks, 0, 0.0, 0.0, None, any_age)
     lengths = {"sensor": wanted[1], "state": wanted[2]}
     windows = {
         name: (window.end[:, None] + np.arange(-lengths[name], 0)).ravel()

@@ -1,7 +1,7 @@
 """What a training step waits for its data, and how near it comes to data that is there already.
 
 The default head of `params.yaml` is trained on a synthetic store (1,026 sensor channels, windows of
-65, 2,048 features) with batches of each feed, and with batches that were gathered beforehand: into
+65, 2,048 features) with batches of the feed, and with batches that were gathered beforehand: into
 RAM, from where a step has to take them to its device. Each round trains a few steps of each in
 turn; all share one model, whose step costs the same whatever it has learnt.
 """
@@ -23,13 +23,12 @@ from benchmarks.timing import Work, arguments, at_least, at_most, race, report
 from pipeline.base.config import TrainHeadParams, load_params
 from pipeline.policy.policy import flop_table
 from pipeline.store import Batch, FeatureStore
-from pipeline.store.gather import WIDE
-from pipeline.train.batches import BatchIndices, FeatureSource, Prefetch, Windows
+from pipeline.train.batches import BatchIndices, Prefetch, Windows
 from pipeline.train.loop import Trainer
 from pipeline.train.run import TrainingRun
 from pipeline.train.split import split_by_episode
 
-RAM = "batches in RAM"
+FEED, RAM = "mapped", "batches in RAM"
 FULL = {"episodes": 20, "ticks": 600, "readings": 4_800, "states": 1_200, "steps": 10}
 QUICK = {"episodes": 3, "ticks": 40, "readings": 320, "states": 80, "steps": 1}
 SMALL = {
@@ -51,8 +50,8 @@ class Contender:
         """A few steps, waited for to the end."""
         begun, waited = time.perf_counter(), self._waited
         for _ in range(self._steps):
-            parts = itertools.islice(self._batches, len(self._trainer.plan.own))
-            self._trainer.learn(parts, lambda: False)
+            parts = itertools.islice(self._batches, self._trainer.params.grad_accumulation)
+            self._trainer.learn(parts)
         if self._trainer.device.type == "cuda":
             torch.cuda.synchronize(self._trainer.device)
         taken = time.perf_counter() - begun
@@ -106,30 +105,23 @@ def make_trainer(folder: Path, sizes: dict[str, int], device: str, quick: bool) 
 def measure(
     trainer: Trainer, steps: int, rounds: int
 ) -> tuple[dict[str, Any], dict[str, Any], list[dict[str, Any]]]:
-    """Steps with each feed against steps with batches that are in RAM."""
+    """Steps with the feed against steps with batches that are in RAM."""
     windows, device = Windows.of(trainer.params), trainer.device
-    fronts = {
-        "mapped": FeatureSource(trainer.store),
-        "device": FeatureSource(trainer.store, WIDE),
-    }
-    feeds = {
-        name: front.feed(trainer.plan.parts_of(_ENDLESS), windows, device)
-        for name, front in fronts.items()
-    }
-    with feeds["mapped"], feeds["device"]:
-        contenders = {name: Contender(trainer, feed, steps) for name, feed in feeds.items()}
-        contenders[RAM] = Contender(trainer, None, steps)
+    with Prefetch(trainer.store, trainer.plan.parts_of(_ENDLESS), windows, device) as feed:
+        contenders = {
+            FEED: Contender(trainer, feed, steps),
+            RAM: Contender(trainer, None, steps),
+        }
         work: dict[str, Work] = {name: one.run for name, one in contenders.items()}
         found = race(work, rounds)
     samples = steps * trainer.params.batch_size
     results: dict[str, Any] = found.results({"steps": steps, "samples": samples})
-    targets: list[dict[str, Any]] = []
-    for name in feeds:
-        share = statistics.median(contenders[name].wait_shares[1:])
-        results[name]["wait_share"] = share
-        targets.append(at_most(f"{name}: share of the step spent waiting", share, 0.02))
-        speed = found.speed(name, RAM)
-        targets.append(at_least(f"{name}: samples/s against batches in RAM", speed, 0.95))
+    share = statistics.median(contenders[FEED].wait_shares[1:])
+    results[FEED]["wait_share"] = share
+    targets = [
+        at_most(f"{FEED}: share of the step spent waiting", share, 0.02),
+        at_least(f"{FEED}: samples/s against batches in RAM", found.speed(FEED, RAM), 0.95),
+    ]
     per_sample = 3 * sum(flops for _, flops in flop_table(trainer.policy))
     for entry in results.values():
         entry["flops_per_s"] = per_sample * entry["samples_per_s"]

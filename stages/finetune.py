@@ -8,7 +8,6 @@ TensorBoard and Weights & Biases).
 
   python -m stages.finetune                                        low-rank adapters
   python -m stages.finetune --set finetune.tuning.method=full      every weight
-  torchrun --nproc_per_node 2 -m stages.finetune                   on two GPUs
 
 If a GPU has too little memory, raise finetune.grad_accumulation, lower finetune.batch_size, or set
 finetune.tuning.gradient_checkpointing=true.
@@ -30,40 +29,22 @@ SHORTHANDS = short("finetune", "--lr", "--steps", "--batch", "--out")
 
 def main(params: "Params") -> None:
     """Tune the model that `vlm` and `finetune` describe."""
-    from pipeline.store import FeatureStore, check_trailers
+    from pipeline.base.machine import resolve_device
+    from pipeline.store import FeatureStore
     from pipeline.train.finetuning import (
         ModelFeatureSource,
         head_params,
         next_steps,
         out_of_memory_named,
     )
-    from pipeline.train.log import check_loggers
-    from pipeline.train.loop import Trainer
-    from pipeline.train.process_group import process_device, process_group
-    from pipeline.train.run import open_run, run_lock
-    from pipeline.train.split import split_by_episode
-    from pipeline.train.training_data import refuse_tuned_episodes
+    from pipeline.train.loop import train
 
-    with process_group(params.train_head.device) as processes:
-        head = head_params(params)
-        processes.shared(lambda: check_loggers(head))
-        store = FeatureStore.open(head.store or params.extract.store)
-        with processes.holding(run_lock(head)), out_of_memory_named():
-            source = ModelFeatureSource(store, params, process_device(head.device))
-            opened = processes.shared(lambda: open_run(head, store, source.identity, "finetune"))
-            processes.say(*opened.notes)
-            if opened.status == "finished":
-                processes.say("nothing to do", *next_steps(params.finetune, store))
-                return
-            if head.check_store:
-                processes.shared(lambda: check_trailers(store.path))
-            split = split_by_episode(store, head.split, head.horizon)
-            processes.say(*refuse_tuned_episodes(store, split))
-            trainer = Trainer(store, head, split, opened, source)
-            processes.say(*trainer.summary(), *source.summary())
-            trainer.fit()
-        processes.say(f"best and last checkpoint: {opened.output}; curves: {head.logs}")
-        processes.say(*next_steps(params.finetune, store))
+    head = head_params(params)
+    store = FeatureStore.open(head.store or params.extract.store)
+    source = ModelFeatureSource(store, params, resolve_device(head.device))
+    with out_of_memory_named():
+        train(store, head, source, "finetune")
+    print("\n".join(next_steps(params.finetune, store)))
 
 
 if __name__ == "__main__":

@@ -74,8 +74,8 @@ def _dependents(entries: "Sequence[StoreEntry]", params: "StoresParams") -> dict
     for entry in entries:
         if entry.kind == "store" and entry.damage is None:
             store = FeatureStore.open(entry.path)
-            depends = ((policy.folder, policy.depends_on(store)) for policy in trained)
-            dependents[entry.path] = [f"{folder}: {how}" for folder, how in depends if how]
+            fitting = (policy.folder for policy in trained if policy.fits(store))
+            dependents[entry.path] = [f"{folder}: can be evaluated on it" for folder in fitting]
     return dependents
 
 

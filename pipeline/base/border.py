@@ -135,10 +135,6 @@ class Border:
             panic = type(error).__name__ == "PanicException"  # Rust's, not an `Exception`
             if isinstance(error, PipelineError) or not (panic or isinstance(error, Exception)):
                 raise
-            if isinstance(error, MemoryError):
-                mend = "Free memory, take a machine with more of it, or leave this out."
-                why = f"{what}: not enough memory for it"
-                raise Border(self.error, mend).refusal(where, why) from error
             text = str(error).removeprefix("Error(s) in ")  # torch's prefix for several
             reason = str(getattr(error, "strerror", None) or f"{type(error).__name__}: {text}")
             why = re.sub(r"<class '(\w+)'>", r"\1", f"{what}: {' '.join(reason.split()):.300}")

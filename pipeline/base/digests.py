@@ -9,7 +9,7 @@ import os
 import sqlite3
 from collections.abc import Callable
 from contextlib import closing, suppress
-from functools import cached_property, lru_cache
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -24,13 +24,14 @@ _APPLICATION = 0x564C4146
 """SQLite's `application_id` of a ledger, in bytes 68 to 71 of its header, big-endian."""
 
 _TABLE = "known (key TEXT PRIMARY KEY, value BLOB)"
+_ALL = "SELECT key, CAST(value AS BLOB) FROM known"
 _DAMAGED = {
     sqlite3.SQLITE_ERROR,
     sqlite3.SQLITE_CORRUPT,
     sqlite3.SQLITE_FORMAT,
     sqlite3.SQLITE_NOTADB,
 }
-"""SQLite's errors that mean a damaged ledger; for a ledger in memory, any error does."""
+"""SQLite's errors that mean a damaged ledger."""
 _FILE = Border(RecordingError, "Copy the file again, or leave its recording out.")
 
 
@@ -41,38 +42,36 @@ class ContentDigests:
     is replaced by an empty one; a damaged entry counts as missing.
     """
 
-    def __init__(self, ledger: Path | None, only_read: bool = False) -> None:
-        self._ledger, self._only_read = ledger, only_read
+    def __init__(self, ledger: Path | None) -> None:
+        self._ledger = ledger
+        self._rows: dict[str, bytes] = {}
+        """All entries: a query for each file would take longer than its `stat`."""
+        self._database: sqlite3.Connection | None = None
         if ledger is not None:
             _refuse_foreign(ledger)
             ledger.parent.mkdir(parents=True, exist_ok=True)
-        self._open()
+            self._open(ledger)
 
     @classmethod
     def to_read(cls, ledger: Path) -> "ContentDigests":
-        """The ledger, or a copy of it in memory where the file cannot be written.
+        """A copy of the ledger in memory, as far as it can be read; the file stays as it is.
 
-        It removes nothing. Raises `ConfigError` where something else lies there.
+        Raises `ConfigError` where something else lies there.
         """
         _refuse_foreign(ledger)
-        try:
-            digests = cls(ledger, only_read=True)
-            digests._query("DELETE FROM known WHERE 0")
-            return digests
-        except (OSError, PipelineError):
-            digests = cls(None)
-            # immutable: otherwise sqlite creates files beside it.
-            place = f"file:{quote(str(ledger.absolute()))}?immutable=1"
-            with (
-                suppress(sqlite3.DatabaseError),  # it only saves reads
-                closing(sqlite3.connect(place, uri=True)) as file,
-            ):
-                file.backup(digests._database)
-            return digests
+        digests = cls(None)
+        # immutable: otherwise sqlite creates files beside it.
+        place = f"file:{quote(str(ledger.absolute()))}?mode=ro&immutable=1"
+        with (
+            suppress(sqlite3.DatabaseError, UnicodeDecodeError),  # it only saves reads
+            closing(sqlite3.connect(place, uri=True)) as file,
+        ):
+            digests._rows = dict(file.execute(_ALL))
+        return digests
 
-    def _open(self) -> None:
+    def _open(self, ledger: Path) -> None:
         try:
-            self._database = sqlite3.connect(self._ledger or ":memory:", isolation_level=None)
+            self._database = sqlite3.connect(ledger, isolation_level=None)
         except sqlite3.OperationalError as error:
             raise self._unusable(error, error.sqlite_errorcode) from None
         if self._query("PRAGMA application_id") != [(_APPLICATION,)]:
@@ -80,10 +79,12 @@ class ContentDigests:
         self._query("PRAGMA journal_mode = WAL")
         self._query("PRAGMA synchronous = OFF")
         self._query(f"CREATE TABLE IF NOT EXISTS {_TABLE}")
+        self._rows = dict(self._query(_ALL) or ())
 
     def close(self) -> None:
         """Close the ledger."""
-        self._database.close()
+        if self._database is not None:
+            self._database.close()
 
     def of(self, path: Path) -> str:
         """The `file_digest` of a file; reads the file if it is not known.
@@ -139,27 +140,21 @@ class ContentDigests:
         self._rows[key] = text
         self._query("INSERT OR REPLACE INTO known VALUES (?, ?)", key, text)
 
-    @cached_property
-    def _rows(self) -> dict[str, bytes]:
-        """All entries, read at once, because a query per file would take longer than its `stat`."""
-        return dict(self._query("SELECT key, CAST(value AS BLOB) FROM known") or ())
-
     def _query(self, statement: str, *values: object) -> list[Any] | None:
         """The result rows of a statement; None where the ledger is damaged, which is then replaced
-        by an empty one (in memory if this one may only be read)."""
+        by an empty one."""
+        if self._database is None or self._ledger is None:
+            return None
         try:
             return self._database.execute(statement, values).fetchall()
         except (sqlite3.DatabaseError, UnicodeDecodeError) as error:
             code = getattr(error, "sqlite_errorcode", sqlite3.SQLITE_CORRUPT) & 0xFF
-            if self._ledger is not None and code not in _DAMAGED:
+            if code not in _DAMAGED:
                 raise self._unusable(error, code) from None
         self._database.close()
-        if self._only_read:
-            self._ledger = None
-        elif self._ledger is not None:
-            for suffix in ("", "-wal", "-shm"):
-                self._ledger.with_name(self._ledger.name + suffix).unlink(missing_ok=True)
-        self._open()
+        for suffix in ("", "-wal", "-shm"):
+            self._ledger.with_name(self._ledger.name + suffix).unlink(missing_ok=True)
+        self._open(self._ledger)
         return None
 
     def _unusable(self, error: Exception, code: int) -> PipelineError:

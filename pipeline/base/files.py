@@ -208,10 +208,6 @@ def recover(complete: Path, target: Path, kind: OutputKind) -> None:
     refuse_foreign(target, kind)
     if there(complete / REPLACED) and not there(target):
         (complete / REPLACED).rename(target)
-    if HELD.marks(earlier := _beside(target, "replaced")):
-        if there(earlier / target.name) and not there(target):
-            (earlier / target.name).rename(target)
-        remove_folder(earlier, HELD)
     # It is still in the complete folder if the user has restored another `target`.
     for replaced in (complete / REPLACED, target / REPLACED):
         if replaced.is_symlink():
@@ -224,8 +220,6 @@ REPORT = OutputKind(
     advice=f" (Reports of earlier versions hold no {MARKER}: move or remove these.)",
 )
 """The reports of evaluations, inspections, probes, comparisons and trainings; keeps its marker."""
-HELD = OutputKind("a folder that is being replaced,")
-"""The folder `<name>.replaced`, into which earlier versions moved the old folder."""
 REPLACED = ".replaced"
 """The place of the old folder in the new one until its removal."""
 

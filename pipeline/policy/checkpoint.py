@@ -55,6 +55,18 @@ Sha256 = Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
 WEIGHTS, DOCUMENT, GOLDEN = "policy.safetensors", "policy.json", "golden.safetensors"
 _FRAMES = "frames/"
 CHECKPOINT = OutputKind("a checkpoint of a policy", lambda folder: (folder / DOCUMENT).is_file())
+TRAINING_ALONE = {
+    "compile",
+    "decay_fraction",
+    "eval_samples",
+    "feed",
+    "loggers",
+    "lr_schedule",
+    "scratch",
+    "sensor_lr",
+    "terminal_stop",
+    "wandb_project",
+}
 _Layout = dict[str, tuple[str, tuple[int, ...]]]
 """The dtype and the shape of each tensor."""
 SOURCE_KEYS = ("feature_spec", "streams", "action_hz", "vlm_reuse_count")
@@ -82,10 +94,10 @@ class PolicyParams(Document):
     @field_validator("train_head", mode="before")
     @classmethod
     def _without_run_params(cls, params: object) -> object:
-        """Leave out params that only the run needs; earlier versions had others of them."""
+        """Leave out params of training alone, of which earlier versions had others."""
         if not isinstance(params, dict):
             return params
-        return {k: params[k] for k in params if k not in ("feed", "loggers", "scratch")}
+        return {k: params[k] for k in params if k not in TRAINING_ALONE}
 
 
 class PolicyDocument(SourceDocument):

@@ -4,7 +4,7 @@ Indices are computed for whole batches; then one `index_select` per stream fills
 speed of a row gather in C. No Python code runs per sample.
 """
 
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, replace
 from typing import Any, Self
 
@@ -60,11 +60,8 @@ class Batch(Observation):
         return self._mapped(lambda tensor: tensor.to(device, non_blocking=non_blocking))
 
     def pin(self) -> Self:
-        """The batch in page-locked memory, from which copies to a GPU are asynchronous.
-
-        Tensors on a device stay there.
-        """
-        return self._mapped(lambda tensor: tensor.pin_memory() if tensor.is_cpu else tensor)
+        """The batch in page-locked memory, from which copies to a GPU are asynchronous."""
+        return self._mapped(lambda tensor: tensor.pin_memory())
 
     def touch(self) -> Self:
         """Zero the batch in place, so that every page of its memory exists before it is filled."""
@@ -138,17 +135,16 @@ class Gatherer:
             },
         )
 
-    def copy(self, selection: Selection, batch: Batch, but: Collection[str] = ()) -> None:
-        """Fill the wide fields of `batch`, except those named in `but`."""
+    def copy(self, selection: Selection, batch: Batch) -> None:
+        """Fill the wide fields of `batch` that the selection names."""
         for name, rows in selection.rows.items():
-            if name not in but:
-                self._expect(name, rows, 1)
-                out: Tensor = getattr(batch, name)
-                flat = out.view(len(rows), *self.tensor(name).shape[1:])
-                torch.index_select(self.tensor(name), 0, torch.from_numpy(rows), out=flat)
+            self._expect(name, rows, 1)
+            out: Tensor = getattr(batch, name)
+            flat = out.view(len(rows), *self.tensor(name).shape[1:])
+            torch.index_select(self.tensor(name), 0, torch.from_numpy(rows), out=flat)
         for name, window in selection.windows.items():
             out = getattr(batch, name)
-            if name not in but and out.numel():
+            if out.numel():
                 self._expect(name, window.end - out.shape[1], out.shape[1])
                 copy_windows(self.tensor(name), window, out)
 
@@ -159,14 +155,11 @@ class Gatherer:
         sensor_window: int,
         state_window: int,
         feature_history: int = 1,
-        but: Collection[str] = (),
     ) -> Batch:
-        """Buffers for `gather(..., out=)`; fields named in `but` have a shape but no memory."""
+        """Buffers for `gather(..., out=)`."""
 
         def wide(name: str, *shape: int) -> Tensor:
             like = self.tensor(name)
-            if name in but:
-                return torch.empty((*shape, *like.shape[1:]), dtype=like.dtype, device="meta")
             return _buffer((*shape, *like.shape[1:]), like.dtype)
 
         features = wide("features", batch, feature_history).flatten(1, 2)
@@ -209,11 +202,10 @@ class Gatherer:
         row = self._arrays["tick/vl_row"][tick]
         return np.maximum(row - lag, self._arrays["episode/vl_start"][episode])
 
-    def populate(self, but: Collection[str]) -> None:
-        """Read the wide fields that fit in memory, one by one, except those in `but`."""
+    def populate(self) -> None:
+        """Read the wide fields that fit in memory, one by one."""
         for name in self.in_memory:
-            if name not in but:
-                populate(self._arrays[WIDE[name]])
+            populate(self._arrays[WIDE[name]])
 
     def _by_variant(self, array: NDArray[Any]) -> tuple[int, ...]:
         rows, slots, *rest = array.shape

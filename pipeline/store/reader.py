@@ -6,7 +6,7 @@ torch is imported with the first batch, not before, because to inspect a store n
 import os
 import sys
 import threading
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -34,7 +34,7 @@ from pipeline.store.schema import (
 )
 
 if TYPE_CHECKING:
-    from pipeline.store.gather import Batch, Gatherer, Late, Selection
+    from pipeline.store.gather import Batch, Gatherer
 
 
 def _one_thread() -> None:
@@ -216,22 +216,7 @@ class FeatureStore:
         that it does not have, an `out` of other sizes, or a negative lag, which would show the
         future.
         """
-        reach_s = sensor_window_s, state_window_s
-        windows = (horizon, sensor_window, state_window, *reach_s, feature_history)
         lags = (feature_lag, sensor_lag_s, state_lag_s)
-        batch, selection = self.select(ticks, windows, lags, out, variants)
-        self.gatherer.copy(selection, batch)
-        return batch
-
-    def select(
-        self,
-        ticks: Sequence[int] | NDArray[np.int64],
-        windows: tuple[int, int, int, float | None, float | None, int],
-        lags: "tuple[Late, Late, Late]",
-        out: "Batch | None",
-        variants: NDArray[np.int64] | None,
-    ) -> "tuple[Batch, Selection]":
-        """The first half of `gather`: fill the fields that are not wide; find the wide ones."""
         if any(np.min(lag, initial=0) < 0 for lag in lags):
             raise ValueError(f"a lag goes back in time and cannot be negative, found {lags}")
         tick = np.asarray(ticks, np.int64)
@@ -245,19 +230,20 @@ class FeatureStore:
                 f"{self.path}: expected a variant in 0..{self.variants - 1} for each of "
                 f"{len(tick)} ticks, asked for {variants}. A store holds `vlm.variants` of them."
             )
-        sizes = (len(tick), *windows[:3])
-        batch = self.gatherer.empty_batch(*sizes, windows[5]) if out is None else out
-        slots = self.feature_shape[0] * windows[5]
+        sizes = (len(tick), horizon, sensor_window, state_window)
+        batch = self.gatherer.empty_batch(*sizes, feature_history) if out is None else out
+        slots = self.feature_shape[0] * feature_history
         if batch.sizes != sizes or batch.features.shape[1] != slots:
             raise ValueError(
                 "`out` has (batch, horizon, sensor_window, state_window) and slots "
                 f"{batch.sizes}, {batch.features.shape[1]}, asked for {sizes}, {slots}"
             )
-        oldest_s = {"sensor": windows[3], "state": windows[4]}
-        return batch, self.gatherer.select(batch, tick, *lags, variants, oldest_s)
+        oldest_s = {"sensor": sensor_window_s, "state": state_window_s}
+        self.gatherer.copy(self.gatherer.select(batch, tick, *lags, variants, oldest_s), batch)
+        return batch
 
-    def warm(self, but: Collection[str] = ()) -> None:
-        """Begin to read the fields that fit in memory, once, in the background; not those in `but`.
+    def warm(self) -> None:
+        """Begin to read the fields that fit in memory, once, in the background.
 
         The reading thread ends with the process, and a forked process has none: page faults read
         the rest.
@@ -265,7 +251,7 @@ class FeatureStore:
         if not self._warmed:
             self._warmed = True
             read = self.gatherer.populate
-            threading.Thread(target=read, args=(but,), name="warm", daemon=True).start()
+            threading.Thread(target=read, name="warm", daemon=True).start()
 
     @cached_property
     def gatherer(self) -> "Gatherer":

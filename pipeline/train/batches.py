@@ -1,39 +1,29 @@
-"""The batches that a policy learns from: their ticks, where they are gathered, and by whom.
+"""The batches that a policy learns from: their ticks, and how they are gathered.
 
 `Prefetch` gathers ahead of time into a few reused buffers: a fresh output for every batch costs
 more in page faults than the gather itself, and a gather between two steps makes the device wait.
-`DeviceStore` holds streams on the device and gathers there; `choose_feed` chooses which. Training
-gets its batches from a `FeatureSource`.
+Training gets its batches from a `FeatureSource`.
 """
 
 import time
 from collections import deque
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import AbstractContextManager
-from dataclasses import astuple, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
 import torch
-from jaxtyping import Shaped
 from numpy.typing import NDArray
-from torch import Tensor
-from tqdm import tqdm
 
 from pipeline.base.config import TrainHeadParams
-from pipeline.base.machine import available_bytes
 from pipeline.base.source import GoldenRow
-from pipeline.base.text import size
 from pipeline.policy.policy import Policy, Trainable
 from pipeline.store import Batch, FeatureStore
-from pipeline.store.gather import WIDE, Index, Late, Selection, Window
-from pipeline.store.mapping import fitting
 
 Ticks = NDArray[np.int64]
-_DEVICE_SHARE = 0.6
-"""The share of the device's free memory that a store may fill; the rest is for the training."""
 
 
 @dataclass(frozen=True)
@@ -43,9 +33,9 @@ class Lags:
     Each is one number for all samples of a batch, or (batch,).
     """
 
-    features: Late = 0
-    sensor_s: Late = 0.0
-    state_s: Late = 0.0
+    features: int | NDArray[np.int64] = 0
+    sensor_s: float | NDArray[np.float64] = 0.0
+    state_s: float | NDArray[np.float64] = 0.0
 
 
 NO_LAGS = Lags()
@@ -103,87 +93,6 @@ class Windows:
         )
 
 
-class DeviceStore:
-    """A copy on a device of the arrays of a store's wide fields (`pipeline.store.gather.WIDE`).
-
-    They are copied once, with a progress bar. For each batch the host computes the rows and sends
-    only a few small index tensors.
-    """
-
-    def __init__(self, store: FeatureStore, fields: Collection[str], device: torch.device) -> None:
-        sources = {name: store.gatherer.tensor(name) for name in sorted(fields)}
-        sources = {name: source for name, source in sources.items() if source.nbytes}
-        self.fields = frozenset(sources)
-        """The fields on the device, without those of streams that the store lacks."""
-        self._device = device
-        bar = tqdm(sources.items(), f"store to {device}", unit="stream", disable=None)
-        self._tensors = {name: source.to(device, copy=True) for name, source in bar}
-
-    def complete(self, batch: Batch, selection: Selection) -> Batch:
-        """The batch with this store's fields gathered on the device; other fields do not move.
-
-        On CUDA it returns without waiting: the work is queued on the current stream.
-        """
-        gathered: dict[str, Tensor] = {}
-        for name in self.fields & selection.rows.keys():
-            shape = getattr(batch, name).shape
-            index = self._send(selection.rows[name])
-            gathered[name] = self._tensors[name].index_select(0, index).view(shape)
-        for name in self.fields & selection.windows.keys():
-            length = getattr(batch, name).shape[1]
-            gathered[name] = self._window(self._tensors[name], selection.windows[name], length)
-        return replace(batch, **gathered)
-
-    def _window(
-        self, readings: Shaped[Tensor, "reading channel"], window: Window, length: int
-    ) -> Shaped[Tensor, "batch window channel"]:
-        """The windows of a batch, with zeros before the first real reading."""
-        place = torch.arange(length, device=self._device)
-        rows = (self._send(window.end)[:, None] + place - length).clamp_(min=0)
-        values = readings.index_select(0, rows.view(-1)).view(*rows.shape, -1)
-        if len(rows) and int(window.valid.min()) < length:
-            before = place < length - self._send(window.valid)[:, None]
-            values.masked_fill_(before[..., None], 0)
-        return values
-
-    def _send(self, index: Index) -> Tensor:
-        host = torch.from_numpy(index)
-        if self._device.type == "cuda":
-            host = host.pin_memory()
-        return host.to(self._device, non_blocking=True)
-
-
-def choose_feed(
-    feed: str, store: FeatureStore, device: torch.device, free: int | None = None
-) -> tuple[frozenset[str], str]:
-    """Which wide fields of a batch to keep on the device, and a line that says why.
-
-    With `feed` "device" these are the streams that fit into a share of its `free` bytes (measured
-    if None), the smallest first; with "auto" all of them if it is a GPU and all fit, else none.
-    """
-    chosen_by = "auto" if feed == "auto" else "as train_head.feed says"
-    if feed == "mapped":
-        return frozenset(), f"feed: mapped ({chosen_by})"
-    if feed == "auto" and device.type != "cuda":
-        return frozenset(), f"feed: mapped (auto: training runs on the {device})"
-    if free is None:
-        on_gpu = device.type == "cuda"
-        free = torch.cuda.mem_get_info(device)[0] if on_gpu else available_bytes()
-    sizes = {name: store.gatherer.tensor(name).nbytes for name in WIDE}
-    wide = {name: count for name, count in sizes.items() if count}
-    fields = fitting(wide, free, _DEVICE_SHARE)
-    room = (
-        f"{_DEVICE_SHARE:.0%} of the {size(free)} free on {device} hold "
-        f"{', '.join(fields) or 'nothing'} of {', '.join(wide)}"
-    )
-    if feed == "auto" and len(fields) < len(wide):
-        return frozenset(), f"feed: mapped (auto: {room})"
-    return frozenset(fields), f"feed: device ({chosen_by}; {room})"
-
-
-_Filled = tuple[BatchIndices, Batch, Selection]
-
-
 @dataclass
 class _Buffer:
     """A reused host batch, and its copy to the device, which must end before it is refilled."""
@@ -199,10 +108,7 @@ class Prefetch(Iterator[tuple[BatchIndices, Batch]], AbstractContextManager["Pre
     valid until the next one is requested; on CUDA it is a copy on the device, made from pinned
     memory, that is never overwritten. `next` raises an exception of the plan or the store at the
     batch it belongs to. Use it as a context manager, or call `close`. The thread does not survive
-    a fork: a forked process must make its own `Prefetch` on the same store.
-
-    The fields of `resident` are gathered on its device, into fresh memory; on CUDA this happens
-    when the batch is handed out, on the consumer's stream. The rest of the store is read into
+    a fork: a forked process must make its own `Prefetch` on the same store. The store is read into
     memory in the background, as far as it fits.
     """
 
@@ -213,17 +119,14 @@ class Prefetch(Iterator[tuple[BatchIndices, Batch]], AbstractContextManager["Pre
         windows: Windows,
         device: torch.device,
         buffers: int = 2,
-        resident: DeviceStore | None = None,
     ) -> None:
         assert buffers >= 2, "one buffer in use, one being filled"
         self.waited_s = 0.0
         """Time that the consumer has spent waiting for data."""
-        self._store, self._device, self._resident = store, device, resident
-        self._windows = astuple(windows)
-        self._on_device = frozenset[str]() if resident is None else resident.fields
+        self._store, self._device, self._windows = store, device, windows
         self._plan = self._warmed(plan)
         self._thread = ThreadPoolExecutor(1, thread_name_prefix="prefetch")
-        self._coming: deque[tuple[_Buffer, Future[_Filled | None]]] = deque()
+        self._coming: deque[tuple[_Buffer, Future[tuple[BatchIndices, Batch] | None]]] = deque()
         for _ in range(buffers):
             self._begin(_Buffer())
         self._in_use: _Buffer | None = None
@@ -243,9 +146,9 @@ class Prefetch(Iterator[tuple[BatchIndices, Batch]], AbstractContextManager["Pre
         if filled is None:
             self.close()
             raise StopIteration
-        indices, batch, selection = filled
+        indices, batch = filled
         if self._device.type == "cuda":
-            batch = self._complete(batch, selection).to(self._device, non_blocking=True)
+            batch = batch.to(self._device, non_blocking=True)
             self._in_use.copied = torch.cuda.Event()
             self._in_use.copied.record(torch.cuda.current_stream(self._device))
         self.waited_s += time.perf_counter() - started
@@ -261,14 +164,14 @@ class Prefetch(Iterator[tuple[BatchIndices, Batch]], AbstractContextManager["Pre
         self.close()
 
     def _warmed(self, plan: Iterable[BatchIndices]) -> Iterator[BatchIndices]:
-        self._store.warm(but=self._on_device)
+        self._store.warm()
         yield from plan
 
     def _begin(self, buffer: _Buffer) -> None:
         self._coming.append((buffer, self._thread.submit(self._fill, buffer)))
 
-    def _fill(self, buffer: _Buffer) -> _Filled | None:
-        """The next batch of the plan, without the fields on a GPU; None at the plan's end."""
+    def _fill(self, buffer: _Buffer) -> tuple[BatchIndices, Batch] | None:
+        """The next batch of the plan, on the host; None at the plan's end."""
         indices = next(self._plan, None)
         if indices is None:
             return None
@@ -276,29 +179,30 @@ class Prefetch(Iterator[tuple[BatchIndices, Batch]], AbstractContextManager["Pre
             buffer.copied.synchronize()
         count = len(indices.ticks)
         if buffer.batch is None or len(buffer.batch) != count:
+            asked = self._windows
             empty = self._store.gatherer.empty_batch(
-                count, *self._windows[:3], feature_history=self._windows[5], but=self._on_device
+                count,
+                asked.horizon,
+                asked.sensor_window,
+                asked.state_window,
+                asked.feature_history,
             )
             buffer.batch = empty.pin() if self._device.type == "cuda" else empty.touch()
-        late = indices.lags
-        lags = (late.features, late.sensor_s, late.state_s)
-        batch, selection = self._store.select(
-            indices.ticks, self._windows, lags, buffer.batch, indices.variants
+        return indices, self._store.gather(
+            indices.ticks,
+            **asdict(self._windows),
+            feature_lag=indices.lags.features,
+            sensor_lag_s=indices.lags.sensor_s,
+            state_lag_s=indices.lags.state_s,
+            variants=indices.variants,
+            out=buffer.batch,
         )
-        self._store.gatherer.copy(selection, batch, but=self._on_device)
-        if self._device.type != "cuda":
-            batch = self._complete(batch, selection)
-        return indices, batch, selection
-
-    def _complete(self, batch: Batch, selection: Selection) -> Batch:
-        return batch if self._resident is None else self._resident.complete(batch, selection)
 
 
 class FeatureSource:
     """Features from the store; only the policy is trained and saved.
 
-    A subclass puts a model before the policy. The wide fields that `on_device` names are kept on
-    the device; the first feed copies them there, once for all feeds.
+    A subclass puts a model before the policy.
     """
 
     identity: Mapping[str, Any] = {}
@@ -306,12 +210,12 @@ class FeatureSource:
     eval_ticks: int | None = None
     """The most val ticks of an evaluation during training; None: the trainer's own limit."""
 
-    def __init__(self, store: FeatureStore, on_device: Collection[str] = (), *notes: str) -> None:
+    def __init__(self, store: FeatureStore) -> None:
         self.store = store
-        self.notes = notes
+
+    def summary(self) -> list[str]:
         """Lines for the user."""
-        self._on_device = on_device
-        self._resident: DeviceStore | None = None
+        return []
 
     @property
     def golden(self) -> tuple[GoldenRow, ...]:
@@ -338,9 +242,7 @@ class FeatureSource:
         self, plan: Iterable[BatchIndices], windows: Windows, device: torch.device
     ) -> Prefetch:
         """The batches of a plan, in its order, in the form that the module takes."""
-        if self._on_device and self._resident is None:
-            self._resident = DeviceStore(self.store, self._on_device, device)
-        return Prefetch(self.store, plan, windows, device, resident=self._resident)
+        return Prefetch(self.store, plan, windows, device)
 
     def save(self, folder: Path, module: Trainable) -> None:
         """Write further files beside the policy's in a checkpoint folder; here there are none."""

@@ -35,7 +35,6 @@ from pipeline.train.finetuning_rows import (
     find_recordings,
     known_digests,
 )
-from pipeline.train.process_group import ProcessGroup
 from pipeline.vlm.feature_spec import FeatureSpec, feature_spec
 from pipeline.vlm.live import LiveVLM
 from pipeline.vlm.preparation import Preparer
@@ -56,15 +55,9 @@ class ModelFeatureSource(FeatureSource):
         """
         super().__init__(store)
         recordings = find_recordings(store, params)
-
-        def checked() -> FeatureSpec:
-            with known_digests(store) as digests:
-                spec = check_spec(store, params, digests)
-                check_recordings(store, recordings, digests)
-            return spec
-
-        # Once for all processes: they would read the same files.
-        self._spec = ProcessGroup.current().shared(checked)
+        with known_digests(store) as digests:
+            self._spec = check_spec(store, params, digests)
+            check_recordings(store, recordings, digests)
         self._vlm, self._finetune = params.vlm, params.finetune
         self._device = device
         self._rows = LiveRows(store, recordings, Preparer(params.vlm, self._spec))
@@ -161,7 +154,7 @@ class ModelFeatureSource(FeatureSource):
 
 
 def head_params(params: Params) -> TrainHeadParams:
-    """`train_head` with the values of `finetune` in place of its own, and nothing compiled.
+    """`train_head` with the values of `finetune` in place of its own.
 
     Raises `ConfigError` where nothing of the model would learn, the policy would not see it, or
     would see more than one row.
@@ -182,8 +175,7 @@ def head_params(params: Params) -> TrainHeadParams:
             f"train_head.feature_history {params.train_head.feature_history}: the model is tuned "
             "on one row a tick. Set it to 1 for stages.finetune."
         )
-    # `finetune.lr` is the model's; rows have many shapes, which torch.compile cannot take.
-    kept = {"lr": params.train_head.lr, "compile": False}
+    kept = {"lr": params.train_head.lr}  # `finetune.lr` is the model's
     shared = TrainHeadParams.model_fields.keys() & FinetuneParams.model_fields.keys()
     changes = {name: getattr(params.finetune, name) for name in shared} | kept
     return params.train_head.model_copy(update=changes)

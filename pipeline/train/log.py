@@ -6,6 +6,7 @@ Weights & Biases, which hold clock times, lie beside it.
 
 import json
 import math
+import os
 from collections.abc import Generator, Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from importlib import import_module
@@ -21,19 +22,13 @@ from pipeline.base.config import TrainHeadParams
 from pipeline.base.errors import ConfigError
 from pipeline.base.files import (
     REPORT,
-    OutputKind,
-    begins_with,
     claim,
     disk_full_named,
     fresh,
-    refuse_foreign,
 )
-from pipeline.train.process_group import ProcessGroup
-from pipeline.train.progress import Pace
 
 FINISH_TIMEOUT_S = 120.0
 """How long a finished run waits until Weights & Biases has sent its remaining rows."""
-_SPEED = "step\tsteps_per_s\tdata_wait_share\tpeak_memory_mib\ttrained_s"
 _MODULES = {"tensorboard": "torch.utils.tensorboard", "wandb": "wandb.sdk"}
 """The module whose import shows that a logger's package is installed. `import wandb` would not show
 it: it also takes a folder `wandb` that a run left behind."""
@@ -183,7 +178,7 @@ class WandB:
         )
         try:
             self._run: Any = wandb.init(
-                project=params.wandb_project,
+                project=os.environ.get("WANDB_PROJECT", "vla-feature-cache"),
                 dir=str(folder),
                 id=_run_id(folder / "id", resumed),
                 name=params.output.name,
@@ -256,18 +251,11 @@ def _beside(logs: Path, name: str) -> Path:
     return logs.with_name(f"{logs.name}.{name}")
 
 
-def speed_file(logs: Path) -> Path:
-    """The file of a training's speed."""
-    return _beside(logs, "speed.tsv")
-
-
 class TrainingLog(AbstractContextManager["TrainingLog"]):
     """Writes the same rows to every logger, and keeps them.
 
     The rows from before a stop, `earlier`, are written again: DVC may have deleted the folder since
-    then, and a killed run has logged steps beyond its last checkpoint. Speed and memory since the
-    last start go to `speed_file`, so that the folder, which DVC tracks, holds no clock time. Raises
-    `DiskFull`.
+    then, and a killed run has logged steps beyond its last checkpoint. Raises `DiskFull`.
     """
 
     def __init__(
@@ -276,10 +264,6 @@ class TrainingLog(AbstractContextManager["TrainingLog"]):
         folder.mkdir(parents=True, exist_ok=True)
         self._folder, self._loggers = folder, loggers
         self.rows: list[Row] = []
-        speed = speed_file(folder)
-        refuse_foreign(speed, OutputKind("a run's speed", begins_with(_SPEED)))
-        self._speed = fresh(speed).open("w", encoding="utf-8")
-        self._speed.write(f"{_SPEED}\n")
         for step, metrics in earlier:
             self.write(step, metrics)
 
@@ -290,39 +274,23 @@ class TrainingLog(AbstractContextManager["TrainingLog"]):
             for logger in self._loggers:
                 logger.write(step, metrics)
 
-    def write_speed(self, step: int, pace: Pace) -> None:
-        """Add a line to `speed_file`."""
-        with disk_full_named(self._folder):
-            self._speed.write(
-                f"{step}\t{pace.steps_per_s:.3f}\t{pace.data_wait_share:.4f}\t"
-                f"{pace.peak_memory / 2**20:.0f}\t{pace.trained_s:.3f}\n"
-            )
-            self._speed.flush()
-
     def __exit__(self, kind: type[BaseException] | None, *raised: object) -> None:
         with disk_full_named(self._folder), ExitStack() as closing:
             # Where a logger fails, the others are closed too.
             for logger in reversed(self._loggers):
                 closing.callback(logger.close, kind is None)
-            closing.callback(self._speed.close)
 
 
 @contextmanager
 def open_log(
-    params: TrainHeadParams, resumed: bool, earlier: Iterable[Row], processes: ProcessGroup
-) -> Generator[TrainingLog | None]:
-    """The log with the loggers of `params` on rank 0, which prints where to look; None elsewhere.
+    params: TrainHeadParams, resumed: bool, earlier: Iterable[Row]
+) -> Generator[TrainingLog]:
+    """The log with the loggers of `params`; prints where to look.
 
-    If it cannot begin, all processes end. Raises `ConfigError` or `DiskFull`.
+    Raises `ConfigError` or `DiskFull`.
     """
-    opened: list[TrainingLog] = []
-    with ExitStack() as stack:
-
-        def begin() -> None:
-            with disk_full_named(params.logs):
-                loggers = open_loggers(params, resumed)
-            opened.append(stack.enter_context(TrainingLog(params.logs, loggers, earlier)))
-            processes.say(*(logger.note for logger in loggers))
-
-        processes.shared(begin)
-        yield opened[0] if opened else None
+    with disk_full_named(params.logs):
+        loggers = open_loggers(params, resumed)
+    with TrainingLog(params.logs, loggers, earlier) as log:
+        print(*(logger.note for logger in loggers), sep="\n")
+        yield log

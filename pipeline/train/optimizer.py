@@ -1,18 +1,14 @@
-"""AdamW for the trainable parameters, its learning rates, the weight average and torch.compile."""
+"""AdamW for the trainable parameters, its learning rates and the weight average."""
 
 import copy
 import math
 from collections.abc import Callable, Mapping
-from typing import Any
 
 import torch
 from torch import Tensor, nn
 from torch.optim.swa_utils import get_ema_multi_avg_fn
 
 from pipeline.base.config import TrainHeadParams
-from pipeline.base.errors import ConfigError
-from pipeline.policy.policy import Trainable
-from pipeline.train.batches import FeatureSource
 
 
 def trainable(module: nn.Module) -> dict[str, nn.Parameter]:
@@ -21,44 +17,30 @@ def trainable(module: nn.Module) -> dict[str, nn.Parameter]:
 
 
 def make_optimizer(
-    module: nn.Module, params: TrainHeadParams, peaks: Mapping[str, float]
+    module: nn.Module, params: TrainHeadParams, peak: Callable[[str], float | None]
 ) -> torch.optim.AdamW:
     """AdamW that decays matrices and kernels, but neither biases, norms nor embeddings.
 
     Loshchilov and Hutter, "Decoupled weight decay regularization", 2019; which parameters do not
     decay follows common practice since BERT: shrinking a gain or an offset regularises nothing.
-    `peaks` has the peak learning rate of a parameter by name; the others have `params.lr`. Frozen
+    `peak` gives the peak learning rate of a parameter by its name; None means `params.lr`. Frozen
     parameters are left out.
     """
     learning = trainable(module)
     groups: dict[tuple[float, float], list[nn.Parameter]] = {}
     for names, decay in zip(decay_groups(module), (params.weight_decay, 0.0), strict=True):
         for name in names:
-            groups.setdefault((peaks.get(name, params.lr), decay), []).append(learning[name])
+            rate = peak(name)
+            rate = params.lr if rate is None else rate
+            groups.setdefault((rate, decay), []).append(learning[name])
     return torch.optim.AdamW(
         [
-            {"params": members, "peak_lr": peak, "lr": peak, "weight_decay": decay}
-            for (peak, decay), members in groups.items()
+            {"params": members, "peak_lr": rate, "lr": rate, "weight_decay": decay}
+            for (rate, decay), members in groups.items()
         ],
         betas=(0.9, 0.95),
         fused=all(value.is_cuda for value in learning.values()),
     )
-
-
-def peak_rates(
-    module: Trainable, source: FeatureSource, params: TrainHeadParams
-) -> dict[str, float]:
-    """The peak learning rate of each parameter that learns, by name.
-
-    The source's rate comes first, then `sensor_lr` for the sensor encoder, then `lr`.
-    """
-    encoders = source.policy_of(module).encoders
-    sensor = {*encoders["sensor"].parameters()} if "sensor" in encoders else set[nn.Parameter]()
-    peaks: dict[str, float] = {}
-    for name, parameter in trainable(module).items():
-        rates = source.parameter_lr(name), params.sensor_lr if parameter in sensor else None
-        peaks[name] = next((rate for rate in rates if rate is not None), params.lr)
-    return peaks
 
 
 def decay_groups(module: nn.Module) -> tuple[list[str], list[str]]:
@@ -77,25 +59,15 @@ def decay_groups(module: nn.Module) -> tuple[list[str], list[str]]:
 def schedule(step: int, params: TrainHeadParams) -> float:
     """Every learning rate at a step, counted from 0, as a share of its peak.
 
-    A linear warm-up: the first step has 1 / warmup_steps, step warmup_steps has 1. Then `cosine`
-    falls along half a cosine to min_lr_fraction at the last step (Loshchilov and Hutter, "SGDR",
-    2017, eq. 5, without restarts), `trapezoid` stays at 1 and falls linearly to it over the last
-    decay_fraction of all steps (warmup-stable-decay: Hu et al., "MiniCPM", 2024), and `constant`
-    stays at 1.
+    A linear warm-up: the first step has 1 / warmup_steps, step warmup_steps has 1. Then it falls
+    along half a cosine to min_lr_fraction at the last step (Loshchilov and Hutter, "SGDR", 2017,
+    eq. 5, without restarts).
     """
     warmup = min(params.warmup_steps, params.max_steps - 1)
     if step < warmup:
         return (step + 1) / warmup
-    if params.lr_schedule == "constant":
-        return 1.0
-    last = params.max_steps - 1
-    begin = warmup
-    if params.lr_schedule == "trapezoid":
-        begin = max(warmup, last - round(params.decay_fraction * params.max_steps))
-    progress = max(0, step - begin) / max(1, last - begin)
-    left = 1 - progress
-    if params.lr_schedule == "cosine":
-        left = 0.5 * (1 + math.cos(math.pi * progress))
+    progress = (step - warmup) / max(1, params.max_steps - 1 - warmup)
+    left = 0.5 * (1 + math.cos(math.pi * progress))
     return params.min_lr_fraction + (1 - params.min_lr_fraction) * left
 
 
@@ -148,30 +120,3 @@ class WeightAverage:
         """Average in the module's weights after optimizer step `updates`, counted from 1."""
         decay = min(self._decay, updates / (updates + 9))
         get_ema_multi_avg_fn(decay)(self._averaged, self._learning, 0)
-
-
-def compiled(loss: Callable[..., Any], device: torch.device) -> Callable[..., Any]:
-    """The function, compiled at its first call; it draws the same random numbers as eager torch.
-
-    That call raises `ConfigError` where torch's code for the device (C++ for a CPU, Triton for a
-    GPU) does not compile.
-    """
-    from torch._dynamo.exc import BackendCompilerFailed  # imported here: it takes a second
-
-    # Without this option Inductor draws dropout and noise from a generator of its own.
-    inner = torch.compile(loss, options={"fallback_random": True})
-
-    def checked(*arguments: Any) -> Any:
-        try:
-            return inner(*arguments)
-        except BackendCompilerFailed as error:
-            lines = (line.strip() for line in str(error).splitlines())
-            why = next((line for line in lines if line and not line.startswith("backend=")), "")
-            raise ConfigError(
-                f"train_head.compile: torch {torch.__version__} fails to compile this policy for "
-                f"{device}: {why}. It takes a C++ compiler (g++ or clang++, or the one that CXX "
-                "names; for a GPU Triton, too) and Python's headers: install them, or set "
-                "train_head.compile=false: the numbers are the same within float noise."
-            ) from None
-
-    return checked

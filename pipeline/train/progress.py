@@ -5,7 +5,7 @@ import sys
 import time
 from collections.abc import Generator
 from contextlib import AbstractContextManager, contextmanager
-from typing import NamedTuple, NoReturn
+from typing import NoReturn
 
 import numpy as np
 import torch
@@ -24,21 +24,8 @@ EVERY_S = 60.0
 """Seconds between two lines where there is no terminal."""
 
 
-class Pace(NamedTuple):
-    """How fast a run goes."""
-
-    steps_per_s: float
-    """Since the previous reading."""
-    data_wait_share: float
-    """The share of that time that was spent waiting for batches."""
-    peak_memory: int
-    """See `peak_memory_bytes`."""
-    trained_s: float
-    """Seconds of training so far, over all starts of the run."""
-
-
 class Progress(AbstractContextManager["Progress"]):
-    """Counts steps on stderr with a bar, or a line a minute; only one process shows it.
+    """Counts steps on stderr with a bar, or a line a minute.
 
     It also measures the pace of the steps and the wait for data; evaluations and checkpoints do not
     count.
@@ -50,13 +37,11 @@ class Progress(AbstractContextManager["Progress"]):
         device: torch.device,
         steps: range,
         trained_s: float = 0.0,
-        shown: bool = True,
     ) -> None:
         # None: shown where stderr is a terminal.
         self._bar: tqdm[NoReturn] = tqdm(
-            initial=steps.start, total=steps.stop, unit="step", disable=None if shown else True
+            initial=steps.start, total=steps.stop, unit="step", disable=None
         )
-        self._writes_lines = shown and self._bar.disable
         self._feed, self._device, self._step, self._total = feed, device, steps.start, steps.stop
         self._last_reading = self._step, trained_s, feed.waited_s
         self._before = trained_s
@@ -68,30 +53,28 @@ class Progress(AbstractContextManager["Progress"]):
         self._step += 1
         self._bar.update()
 
-    def read(self) -> Pace:
-        """The pace since the last call."""
+    def show(self, loss: float, lr: float) -> None:
+        """Show these and the pace since the last call behind the bar.
+
+        Without a bar, print a line if the last is a minute old.
+        """
         step, trained, waited = self._last_reading
         self._last_reading = self._step, self.trained_s, self._feed.waited_s
         elapsed = max(self.trained_s - trained, 1e-9)
-        share = (self._feed.waited_s - waited) / elapsed
-        pace = (self._step - step) / elapsed
-        return Pace(pace, share, peak_memory_bytes(self._device), self.trained_s)
-
-    def show(self, pace: Pace, loss: float, lr: float) -> None:
-        """Show these behind the bar; without a bar, print a line if the last is a minute old."""
+        steps_per_s = (self._step - step) / elapsed
         self._bar.set_postfix(
             loss=f"{loss:.4f}",
             lr=f"{lr:.1e}",
-            wait=f"{pace.data_wait_share:.0%}",
-            mem=f"{pace.peak_memory / 2**30:.1f}G",
+            wait=f"{(self._feed.waited_s - waited) / elapsed:.0%}",
+            mem=f"{peak_memory_bytes(self._device) / 2**30:.1f}G",
         )
         now = time.perf_counter()
-        if self._writes_lines and now - self._last_line >= EVERY_S:
+        if self._bar.disable and now - self._last_line >= EVERY_S:
             self._last_line = now
-            left = duration((self._total - self._step) / pace.steps_per_s)
+            left = duration((self._total - self._step) / steps_per_s)
             print(
                 f"step {self._step} of {self._total}: train loss {loss:.4f}, "
-                f"{pace.steps_per_s:.3g} steps/s, about {left} left",
+                f"{steps_per_s:.3g} steps/s, about {left} left",
                 file=sys.stderr,
                 flush=True,
             )
@@ -142,20 +125,10 @@ def describe_data(
         f"split: {len(split.train)} training ticks, {len(split.val)} val, {len(split.test)} test "
         f"of {' + '.join(str(len(names)) for names in groups)} groups{cut}",
     ]
-    if (dtype := store.spec.get("storage_dtype")) in ("int8", "float8"):
-        lines.append(
-            f"features are stored in {dtype}; stages.probe with probe.codecs on a store in float32 "
-            "says what that loses"
-        )
     if anchored := shape.anchored(store.streams["action"]["names"]):
         lines.append(f"anchored at the newest frame: {', '.join(anchored)}")
     if not len(split.test):
         lines.append("split: nothing is test, so nothing is left for stages.evaluate to report on")
-    elif len(groups[-1]) == 1 and not cut and params.split.folds is None:
-        lines.append(
-            "split: errors on one test group have no interval; five folds test each recording once "
-            "(docs/training.md)"
-        )
     if split.note:
         lines.append(f"split: {split.note}")
     lost: list[str] = []

@@ -63,32 +63,25 @@ identity, so that no run is resumed by code with other numbers."""
 FREE_PARAMS = {
     "anew",
     "device",
-    "feed",
     "check_store",
     "output",
     "logs",
     "loggers",
-    "wandb_project",
     "checkpoint_every",
     "store",
     "grad_accumulation",
 }
 """Params that may change between a stop and the next start: they decide no number of the run.
-`grad_accumulation` times the number of processes is `parts`, which is compared instead."""
+`grad_accumulation` is compared as `parts`."""
 NOTHING: Mapping[str, Any] = MappingProxyType({})
-
-
-class RunInputs(Document):
-    """What decided the numbers of a run; only `recordings` is read, the rest is compared."""
-
-    recordings: dict[Text, JsonValue]
 
 
 class RunDocument(Document):
     """The content of `run.json`."""
 
     source: SourceDocument
-    decides: RunInputs
+    decides: dict[Text, JsonValue]
+    """What decided the numbers of the run."""
 
 
 @dataclass(frozen=True)
@@ -218,10 +211,9 @@ RUN_FOLDER = OutputKind("a training run", _is_run)
 def finished_run(params: TrainHeadParams, path: Path) -> TrainingRun | None:
     """The run of these params on the store at `path` if it is finished, as `open_run` gives it.
 
-    None where it is not, and where several processes train together. Imports no torch.
+    None where it is not. Imports no torch.
     """
-    together = int(os.environ.get("WORLD_SIZE", "1")) > 1
-    if together or params.anew or not (params.output / RUN).exists():
+    if params.anew or not (params.output / RUN).exists():
         return None
     with build_lock(params.output):
         run = open_run(params, FeatureStore.open(path))
@@ -266,7 +258,7 @@ def run_identity(
     decides = {
         "trainer_version": TRAINER_VERSION,
         "train_head": params.model_dump(mode="json", exclude=FREE_PARAMS),
-        "parts": int(os.environ.get("WORLD_SIZE", "1")) * params.grad_accumulation,
+        "parts": params.grad_accumulation,
         "front": dict(extra_identity),
         "recordings": recordings_of(store),
     }
@@ -312,28 +304,22 @@ def policy_shape(
 
 @dataclass(frozen=True)
 class TrainedPolicy:
-    """A training run, or a checkpoint copied out of one, which may depend on a store."""
+    """A training run, or a checkpoint copied out of one."""
 
     folder: Path
     source: Mapping[str, Any] | None = None
-    """Its store, as `source_of` describes it; None where its document is damaged."""
-    recordings: Mapping[str, Any] | None = None
-    """For a run: the episodes and rows of its store."""
-    episodes: frozenset[str] | None = None
-    """For a single checkpoint: digests of the files of its training and test episodes; None if it
-    has no test episode."""
+    """Its store, as `source_of` describes it."""
+    contents: frozenset[str] = frozenset()
+    """Digests of the files of its episodes."""
     damage: str | None = None
+    """Why it cannot be read, so that nothing else is known."""
 
-    def depends_on(self, store: FeatureStore) -> str | None:
-        """How it depends on a store, in words; None where it does not."""
+    def fits(self, store: FeatureStore) -> bool:
+        """Whether a store has its features and all its episodes."""
+        here = {episode.content for episode in store.episodes}
         if self.source is None or differences(self.source, source_of(store)):
-            return None
-        if self.recordings is not None:
-            return "trained on it" if self.recordings == recordings_of(store) else None
-        contents = {episode.content for episode in store.episodes}
-        if self.episodes is not None and contents.issuperset(self.episodes):
-            return "can be evaluated on it, has its features, training and test episodes"
-        return None
+            return False
+        return here.issuperset(self.contents)
 
 
 def find_trained(folders: Sequence[Path]) -> list[TrainedPolicy]:
@@ -341,21 +327,20 @@ def find_trained(folders: Sequence[Path]) -> list[TrainedPolicy]:
     trained: list[TrainedPolicy] = []
     for folder, below, files in chain.from_iterable(map(os.walk, folders)):
         below.sort()
-        document = next((name for name in (RUN, DOCUMENT) if name in files), None)
-        if document is not None:
+        documents = [Path(folder, DOCUMENT)] if DOCUMENT in files else []
+        if RUN in files:
+            documents = sorted(Path(folder).glob(f"*/{DOCUMENT}"))
+        if documents:
             below.clear()
-            trained.append(_read_trained(Path(folder), Path(folder, document)))
+            trained.append(_read_trained(Path(folder), documents[0]))
     return trained
 
 
 def _read_trained(folder: Path, path: Path) -> TrainedPolicy:
     try:
-        if path.name == RUN:
-            _, run = read_document(path, RunDocument)
-            return TrainedPolicy(folder, run["source"], run["decides"]["recordings"])
         document, raw = read_document(path, PolicyDocument)
     except CheckpointIncomplete as error:
         return TrainedPolicy(folder, damage=str(error))
-    train, test = (document.split[side].values() for side in ("train", "test"))
-    episodes = frozenset(part.content for part in (*train, *test)) if test else None
-    return TrainedPolicy(folder, {key: raw[key] for key in SOURCE_KEYS}, episodes=episodes)
+    parts = chain.from_iterable(side.values() for side in document.split.values())
+    source = {key: raw[key] for key in SOURCE_KEYS}
+    return TrainedPolicy(folder, source, frozenset(part.content for part in parts))

@@ -17,7 +17,6 @@ from pipeline.base.config import TrainHeadParams
 from pipeline.base.errors import ConfigError
 from pipeline.store import FeatureStore
 from pipeline.train.batches import BatchIndices, Lags, Ticks
-from pipeline.train.process_group import ProcessGroup
 from pipeline.train.split import Split, hash64
 
 
@@ -142,12 +141,10 @@ class StepPart(BatchIndices):
 
 
 class Plan:
-    """The ticks of every step, cut into one part for each process and accumulation.
+    """The ticks of every step, cut into `grad_accumulation` parts.
 
-    With `grad_accumulation` a, process p has the parts p·a to p·a + a - 1, so N processes do what
-    one process does with N times the accumulation. Everything follows from params and store:
-    processes exchange nothing. `section` is the section of the params that errors name. Raises
-    `ConfigError` where a part would be empty.
+    `section` is the section of the params that errors name. Raises `ConfigError` where a part would
+    be empty.
     """
 
     def __init__(
@@ -155,19 +152,14 @@ class Plan:
         store: FeatureStore,
         params: TrainHeadParams,
         split: Split,
-        processes: ProcessGroup,
         section: str = "train_head",
     ) -> None:
-        self.parts = processes.size * params.grad_accumulation
-        if params.batch_size < self.parts:
+        if params.batch_size < params.grad_accumulation:
             raise ConfigError(
-                f"{section}.batch_size is {params.batch_size}: expected a tick at least for "
-                f"each of the {self.parts} parts of a step ({processes.size} process(es) x "
-                f"grad_accumulation {params.grad_accumulation}). Raise it, or accumulate less."
+                f"{section}.batch_size is {params.batch_size}: expected a tick at least for each "
+                f"of the {params.grad_accumulation} parts of {section}.grad_accumulation. Raise "
+                "it, or accumulate less."
             )
-        first = processes.rank * params.grad_accumulation
-        self.own = range(first, first + params.grad_accumulation)
-        """The parts of this process."""
         self._sampler = TickSampler(
             ticks_by_source(store, split.train), params.mixture, params.batch_size, params.seed
         )
@@ -176,11 +168,11 @@ class Plan:
         self._ends = np.repeat(starts[1:], np.diff(starts))
 
     def ticks(self, step: int) -> Ticks:
-        """The ticks (batch_size,) of a step, over all parts and processes."""
+        """The ticks (batch_size,) of a step, over all parts."""
         return self._sampler.batch(step)
 
     def step(self, step: int) -> list[StepPart]:
-        """This process's parts of a step, counted from 0."""
+        """The parts of a step, counted from 0."""
         ticks, seed = self.ticks(step), self._params.seed
         variants: NDArray[np.int64] | None = None
         if self._variants > 1:
@@ -189,22 +181,20 @@ class Plan:
         late = np.random.default_rng((seed, step, *_LAGS))
         feature_lag = late.integers(self._params.feature_lag + 1, size=len(ticks))
         sensor_lag_s = late.uniform(0, self._params.sensor_lag_s, len(ticks))
-        # Only chunk steps before the episode's end count; with terminal_stop all do.
-        counts = np.full(len(ticks), self._params.horizon)
-        if not self._params.terminal_stop:
-            counts = np.minimum(counts, self._ends[ticks] - ticks)
-        cuts = np.array_split(np.arange(len(ticks)), self.parts)
+        # Only chunk steps before the episode's end count.
+        counts = np.minimum(self._params.horizon, self._ends[ticks] - ticks)
+        cuts = np.array_split(np.arange(len(ticks)), self._params.grad_accumulation)
         return [
             StepPart(
-                ticks[cuts[p]],
-                None if variants is None else variants[cuts[p]],
-                Lags(feature_lag[cuts[p]], sensor_lag_s[cuts[p]]),
-                share=float(counts[cuts[p]].sum() / counts.sum()),
+                ticks[cut],
+                None if variants is None else variants[cut],
+                Lags(feature_lag[cut], sensor_lag_s[cut]),
+                share=float(counts[cut].sum() / counts.sum()),
                 seed=int(np.random.SeedSequence((seed, step, p)).generate_state(1, np.uint64)[0]),
             )
-            for p in self.own
+            for p, cut in enumerate(cuts)
         ]
 
     def parts_of(self, steps: range) -> Iterator[StepPart]:
-        """This process's parts of these steps, one after the other."""
+        """The parts of these steps, one after the other."""
         return (part for step in steps for part in self.step(step))

@@ -78,19 +78,17 @@ def find_ticks(
             f"trained with train_head.split.{side} 0, or on too short a recording. Train again "
             f"with train_head.split.{side} above 0."
         )
-    by_name = {episode_name(episode): episode for episode in store.episodes}
-    renamed: dict[str, list[Episode]] = {}
-    for name, episode in by_name.items():
-        if name not in parts or parts[name].content != episode.content:
-            renamed.setdefault(episode.content, []).append(episode)
+    left: dict[str, dict[str, Episode]] = {}
+    for episode in store.episodes:
+        left.setdefault(episode.content, {})[episode_name(episode)] = episode
     matches: list[tuple[Episode, EpisodePart]] = []
     wrong: list[str] = []
     for name, part in parts.items():
-        episode = by_name.get(name)
-        same = episode is not None and episode.content == part.content
-        if not same and (candidates := renamed.get(part.content)):
-            episode = candidates.pop()
-        if episode is None or episode.content != part.content or len(episode.ticks) < part.ticks[1]:
+        alike = left.get(part.content, {})
+        episode = alike.pop(name, None)
+        if episode is None and alike:  # renamed since
+            episode = alike.popitem()[1]
+        if episode is None or len(episode.ticks) < part.ticks[1]:
             wrong.append(name)
         else:
             matches.append((episode, part))

@@ -84,7 +84,6 @@ def test_lines_are_bounded_and_named(tmp_path: Path) -> None:
         (ValueError("one\n two"), "f: cannot be read: ValueError: one two. Copy it again."),
         (EOFError(), "f: cannot be read: EOFError. Copy it again."),
         (PermissionError(13, "Permission denied"), "f: cannot be read: Permission denied."),
-        (MemoryError(), "not enough memory for it. Free memory, take a machine with more"),
     ],
 )
 def test_an_error_of_another_library_becomes_one_sentence(error: Exception, message: str) -> None:

@@ -92,7 +92,7 @@ def test_every_problem_is_said_with_its_place(minimal):
     text = str(caught.value)
     assert "3 problem(s)" in text
     assert "train_head.lr: expected greater than 0, found -1" in text
-    assert "train_head.lrr: unknown key; did you mean lr?" in text
+    assert "train_head.lrr: unknown key; --keys lists" in text
     assert "data.vlm_reuse_count" in text
 
 
@@ -109,18 +109,13 @@ def test_every_problem_is_said_with_its_place(minimal):
         ("extract.store.name=x", "extract.store: expected a path, found keys with values"),
         ("data.action_hz=.nan", "data.action_hz: expected a finite number, found nan"),
         ("data.root=!!python/name:os.system", "could not determine a constructor"),
-        ("data.root=" + "x/" * 2000, "data.root: expected a path of at most 3,000 characters"),
-        ("train_head.output=" + "x" * 250, "train_head.output: expected a path"),
         ("serve.port=2026-01-01", "serve.port: expected a valid integer"),
         ("extract.workers=1000000", "extract.workers: expected a number of processes up to"),
         ("vlm.prompt='{picture}'", "only {instruction} and {images}"),
         ("vlm.prompt='{images}{images}'", "may stand once"),
         ("extract.store=cache_store/demo", "ends in .zarr"),
         ("data.sources=[{name: a, path: x}, {name: a, path: y}]", "stands more than once"),
-        ("train_head.mixture={other: 1}", "mixture names other, but data.sources has"),
         ("train_head.lr=yes", "train_head.lr: expected a number, found true or false"),
-        ("train_head.mixture={a: yes}", "train_head.mixture: expected a number, found true"),
-        ("extract.workers=somehost", "extract.workers"),
         ("train_head.diffusion={timesteps: 20, sampling_steps: 50}", "above timesteps 20"),
     ],
 )

@@ -11,9 +11,7 @@ import torch
 from pipeline.base import files
 from pipeline.base.errors import CheckpointIncomplete, DiskFull
 from pipeline.base.files import (
-    HELD,
     OutputKind,
-    begin_folder,
     check_digest,
     fresh,
     put_in_place,
@@ -65,17 +63,6 @@ def test_a_kill_between_any_two_steps_leaves_the_old_or_the_new(tmp_path, monkey
     assert os.listdir(tmp_path) == ["last"]
 
 
-def test_a_link_of_the_user_beside_it_stays(tmp_path: Path) -> None:
-    put(tmp_path / "kept", "mine")
-    put(tmp_path / "last", "old")
-    link = tmp_path / "last.old"
-    link.symlink_to("kept")
-    put(tmp_path / "last", "new")
-    assert link.is_symlink()
-    assert (link / "a").read_text() == "mine"
-    assert (tmp_path / "last" / "a").read_text() == "new"
-
-
 @pytest.mark.parametrize("linked", [False, True])
 def test_a_kill_at_any_step_of_a_replacement_is_undone_or_completed(tmp_path, linked):
     """Kill before the n-th change of the folder, for every n, until none is left."""
@@ -98,20 +85,6 @@ def test_a_kill_at_any_step_of_a_replacement_is_undone_or_completed(tmp_path, li
             assert kill_at >= 4
             return
     raise AssertionError("more steps than expected")
-
-
-@pytest.mark.parametrize("gone", [False, True])
-def test_what_an_earlier_version_was_killed_over_is_recovered(tmp_path: Path, gone: bool) -> None:
-    """It put the old folder into a marked one."""
-    put(tmp_path / "last", "old")
-    begin_folder(tmp_path / "last.replaced", HELD)
-    (tmp_path / "last").rename(tmp_path / "last.replaced" / "last")
-    if not gone:
-        put(tmp_path / "other", "new")
-        (tmp_path / "other").rename(tmp_path / "last")
-    recover(tmp_path / "last.new", tmp_path / "last", KIND)
-    assert (tmp_path / "last" / "a").read_text() == ("old" if gone else "new")
-    assert os.listdir(tmp_path) == ["last"]
 
 
 def test_a_failed_write_keeps_the_old(tmp_path: Path) -> None:

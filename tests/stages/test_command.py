@@ -50,9 +50,9 @@ def test_two_for_bad_params_and_a_misspelt_key_is_recognised(capsys):
     options = [word for override in wrong for word in ("--set", override)]
     assert run("Summary.", print, ["--params", PARAMS, *options]) == 2
     err = capsys.readouterr().err
-    assert "nothing: unknown key; expected one of: demo, data, vlm" in err
-    assert "train_head.expert.layer: unknown key; did you mean layers?" in err
-    assert "data.sources.0.paths: unknown key; did you mean path?" in err
+    assert "nothing: unknown key; --keys lists" in err
+    assert "train_head.expert.layer: unknown key; --keys lists" in err
+    assert "data.sources.0.paths: unknown key; --keys lists" in err
     assert "data.sources.1: expected either path or hub, found neither" in err
 
 

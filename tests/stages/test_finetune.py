@@ -17,19 +17,21 @@ Said = pytest.CaptureFixture[str]
 Make = Callable[..., Any]
 
 HELD = """
-import sys, time
+import signal, sys, time
 from pipeline.train.loop import Trainer
 from stages import finetune
 from stages.command import run
 
 step = Trainer._train_step
-def held(self, batches, interrupted):
-    stopped = step(self, batches, interrupted)
+def held(self, batches):
+    step(self, batches)
     if self.step == 3:
+        both = signal.SIGINT, signal.SIGTERM
+        signal.pthread_sigmask(signal.SIG_BLOCK, both)
         print("holding", flush=True)
-        while not interrupted():
+        while not signal.sigpending():
             time.sleep(0.01)
-    return stopped
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, both)
 Trainer._train_step = held
 sys.exit(run("", finetune.main, ["--params", sys.argv[1]]))
 """

@@ -47,7 +47,7 @@ def test_list_names_what_was_trained_on_a_store(params, tiny_store, tmp_path, ca
     best = tmp_path / "models" / "head" / "best"
     subprocess.run(["cp", "-r", best, tmp_path / "models" / "lone"], check=True)
     (tmp_path / "models" / "broken").mkdir()
-    (tmp_path / "models" / "broken" / "run.json").write_text("{")
+    (tmp_path / "models" / "broken" / "policy.json").write_text("{")
     capsys.readouterr()
     assert command(params, "list") == 0
     said = capsys.readouterr()
@@ -57,17 +57,17 @@ def test_list_names_what_was_trained_on_a_store(params, tiny_store, tmp_path, ca
     )
     of_first = "\n".join(lines[first:second])
     of_second = "\n".join(lines[second:])
-    assert f"{tmp_path}/models/head: trained on it" in of_first
+    assert f"{tmp_path}/models/head: can be evaluated on it" in of_first
     assert f"{tmp_path}/models/lone: can be evaluated on it" in of_first
     assert "models" not in of_second
-    lone = next(policy for policy in find_trained([tmp_path / "models"]) if policy.episodes)
+    lone = next(p for p in find_trained([tmp_path / "models"]) if p.folder.name == "lone")
     store = FeatureStore.open(stores / "one.zarr")
     fewer = tiny_store(tmp_path / "fewer", name="one", episodes=5)
-    assert lone.depends_on(store)
-    assert lone.depends_on(FeatureStore.open(fewer)) is None
+    assert lone.fits(store)
+    assert not lone.fits(FeatureStore.open(fewer))
     assert "spec tiny-spe: 3 slots x 8 in float32" in said.out
     assert "prompt {instruction}" in said.out
-    assert "broken/run.json" in said.err
+    assert "broken/policy.json" in said.err
 
 
 def test_merge_gives_a_store_that_trains(params, tiny_store, tmp_path, capsys):

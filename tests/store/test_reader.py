@@ -377,10 +377,10 @@ class TestMemory:
         monkeypatch.setattr("pipeline.store.gather.populate", lambda array: read.append(array))
         store = FeatureStore.open(path)
         for _ in range(2):
-            store.warm(but={"sensor"})
+            store.warm()
         for thread in threading.enumerate():
             if thread.name == "warm":
                 thread.join()
-        names = ("tick/action", "vl/features", "state/values")
+        names = ("tick/action", "vl/features", "state/values", "sensor/values")
         assert {id(array) for array in read} == {id(store.array(name)) for name in names}
-        assert len(read) == 3
+        assert len(read) == 4

@@ -84,10 +84,10 @@ def stop_at(monkeypatch):
     real = Trainer._train_step
 
     def stop(trainer: Trainer, step: int | None) -> None:
-        def killed(self: Trainer, *rest: Any) -> bool:
+        def killed(self: Trainer, *rest: Any) -> None:
             if self.step == step:
                 raise Stop
-            return real(self, *rest)
+            real(self, *rest)
 
         def killed_at_the_end(*rest: object) -> None:
             raise Stop

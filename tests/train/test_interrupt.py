@@ -6,7 +6,7 @@ import threading
 
 import pytest
 
-from pipeline.train.process_group import deferred_interrupt
+from pipeline.train.loop import deferred_interrupt
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

@@ -27,7 +27,7 @@ from pipeline.base.config import TrainHeadParams
 from pipeline.train.log import WandB
 
 place = Path(sys.argv[1])
-params = TrainHeadParams(output=place / "head", wandb_project="needles")
+params = TrainHeadParams(output=place / "head")
 for resumed in (False, True):
     run = WandB(place / "logs.wandb", params, resumed)
     print(run.note, (place / "logs.wandb/id").read_text())
@@ -104,12 +104,12 @@ def test_every_logger_has_the_curves_of_dvc_after_a_stop_too(
 
 def test_who_shows_the_curves_decides_no_number(store, params):
     identity = run_identity(params(loggers=[]), store)
-    assert run_identity(params(loggers=["tensorboard"], wandb_project="other"), store) == identity
+    assert run_identity(params(loggers=["tensorboard"]), store) == identity
     decides = identity["decides"]["train_head"]
-    assert not {"loggers", "wandb_project"} & decides.keys(), "as a run of before knows them"
+    assert "loggers" not in decides
 
 
-EARLIER = {"loggers": ["report"], "scratch": None, "feed": "compressed"}
+EARLIER = {"loggers": ["report"], "scratch": None, "feed": "compressed", "sensor_lr": 1e-3}
 """Keys and values of `train_head` that there were."""
 
 
@@ -118,7 +118,6 @@ def test_a_run_of_an_earlier_version_goes_on(store, params, trainer, stop_at):
     written = params().output.with_name("head.part") / "last" / "policy.json"
     document = read_document(written, dict)[1]
     head = document["params"]["train_head"]
-    del head["wandb_project"]
     head |= EARLIER
     write_document(written, document)
     resumed = trainer(store, params())
@@ -184,7 +183,9 @@ def test_weights_and_biases_keeps_a_run_offline_and_goes_on_under_its_id(tmp_pat
         capture_output=True,
         text=True,
         timeout=100,
-        env=os.environ | private | {"WANDB_MODE": "offline", "PYTHONPATH": str(ROOT)},
+        env=os.environ
+        | private
+        | {"WANDB_MODE": "offline", "WANDB_PROJECT": "needles", "PYTHONPATH": str(ROOT)},
     )
     assert (ran.returncode, ran.stderr) == (0, "")
     first, again = ran.stdout.splitlines()
@@ -231,10 +232,11 @@ def test_rows_that_the_service_has_are_not_sent_again_and_its_loss_stops_nothing
     tmp_path, monkeypatch, capsys
 ):
     service = Service(starting_step=21)
+    monkeypatch.setenv("WANDB_PROJECT", "needles")
     monkeypatch.setitem(sys.modules, "wandb", service)
     identifiers = []
     for resumed in (False, False, True):  # a new run has an id of its own
-        run = loggers.WandB(tmp_path, TrainHeadParams(wandb_project="needles"), resumed)
+        run = loggers.WandB(tmp_path, TrainHeadParams(), resumed)
         identifiers.append(service.given["id"])
     assert identifiers[0] != identifiers[1] == identifiers[2]
     assert (service.given["project"], service.given["resume"]) == ("needles", "allow")

@@ -18,9 +18,7 @@ from pipeline.base.files import read_document
 from pipeline.policy.checkpoint import load_policy
 from pipeline.store import FeatureStore
 from pipeline.train.batches import Windows
-from pipeline.train.checkpoints import read_trainer
-from pipeline.train.log import speed_file
-from pipeline.train.loop import Trainer
+from pipeline.train.loop import Trainer, read_trainer
 from pipeline.train.predictions import predict
 from pipeline.train.run import TRAINER_VERSION
 from pipeline.train.scores import action_space, compare
@@ -71,10 +69,10 @@ def test_a_signal_ends_the_step_and_saves_once(store, params, trainer, undisturb
     real, save = Trainer._train_step, Trainer._save_last
     saved: list[int] = []
 
-    def signalled(self: Trainer, *rest: Any) -> bool:
+    def signalled(self: Trainer, *rest: Any) -> None:
         if self.step == 12:
             os.kill(os.getpid(), signal.SIGTERM)
-        return real(self, *rest)
+        real(self, *rest)
 
     def counted(self: Trainer, *rest: Any) -> None:
         saved.append(self.step)
@@ -201,7 +199,7 @@ def test_logs_need_no_repository_and_change_none(store, params, trainer, tmp_pat
     (tmp_path / ".dvc").mkdir()
     monkeypatch.chdir(tmp_path)
     trainer(store, params(max_steps=1)).fit()
-    found = {".git", ".dvc", "head", "logs", "logs.speed.tsv"}
+    found = {".git", ".dvc", "head", "logs"}
     assert found == set(os.listdir(tmp_path))
     assert json.loads((tmp_path / "logs/metrics.json").read_text())["step"] == 1
 
@@ -241,22 +239,13 @@ def test_autocast_trains_in_bfloat16(store, params, trainer, undisturbed, stop_a
     assert all(value.dtype == torch.float32 for value in rough.policy.state_dict().values())
 
 
-def test_logs_stay_known_where_no_speed_lies_beside_them(store, params, trainer):
-    """As DVC restores them in another checkout."""
-    short = {"max_steps": 1, "loggers": []}
-    trainer(store, params(**short)).fit()
-    speed_file(params().logs).unlink()
-    trainer(store, params(seed=3, **short)).fit()
-    assert (params().logs / "metrics.json").exists()
-
-
 def test_logs_never_write_through_a_link(store, params, trainer, tmp_path):
     """As DVC restores an output: every file a link into its cache."""
     short = {"max_steps": 3, "eval_every": 2}
     trainer(store, params(**short)).fit()
     logs, cache = params().logs, tmp_path / "cache"
     kept = {}
-    for file in [*logs.rglob("*.*"), logs.with_name("logs.speed.tsv")]:
+    for file in logs.rglob("*.*"):
         if file.is_file():
             linked = cache / str(len(kept))
             cache.mkdir(exist_ok=True)

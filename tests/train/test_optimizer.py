@@ -1,6 +1,6 @@
 """Learning rate, decay groups, averaging, history."""
 
-from itertools import pairwise, product
+from itertools import pairwise
 
 import pytest
 import torch
@@ -42,53 +42,19 @@ def test_the_rate_warms_up_peaks_and_ends_at_its_floor():
     assert all(a >= b for a, b in pairwise(rates[10:]))
 
 
-def test_a_trapezoid_stays_and_then_falls_in_a_line():
-    params = TrainHeadParams(
-        lr_schedule="trapezoid",
-        warmup_steps=10,
-        max_steps=100,
-        decay_fraction=0.2,
-        min_lr_fraction=0.1,
-    )
-    rates = [schedule(step, params) for step in range(100)]
-    assert rates[:10] == pytest.approx([0.1 * step for step in range(1, 11)])
-    assert set(rates[10:80]) == {1.0}
-    assert rates[89] == pytest.approx(0.55)
-    assert rates[99] == pytest.approx(0.1)
-    falls = [a - b for a, b in pairwise(rates[79:])]
-    assert falls == pytest.approx([0.9 / 20] * 20)
-
-
-def test_a_constant_rate_only_warms_up():
-    params = TrainHeadParams(lr_schedule="constant", warmup_steps=4, max_steps=50)
-    rates = [schedule(step, params) for step in range(50)]
-    assert rates[:4] == [0.25, 0.5, 0.75, 1.0]
-    assert set(rates[4:]) == {1.0}
-
-
-@pytest.mark.parametrize("kind", ["cosine", "trapezoid", "constant"])
-def test_every_schedule_is_sane_at_the_extremes(kind):
-    edges = ((0, 1), (0, 2), (5, 5), (100, 3), (1, 2), (3, 40))
-    for decay, (warmup, steps) in product((0.0, 0.5, 1.0), edges):
-        params = TrainHeadParams.model_validate(
-            {
-                "lr_schedule": kind,
-                "decay_fraction": decay,
-                "warmup_steps": warmup,
-                "max_steps": steps,
-                "min_lr_fraction": 0,
-            }
-        )
-        rates = [schedule(step, params) for step in range(steps)]
-        assert all(0 <= rate <= 1 for rate in rates)
-        assert max(rates) == 1.0
+@pytest.mark.parametrize(("warmup", "steps"), [(0, 1), (5, 5), (100, 3), (1, 2), (3, 40)])
+def test_the_rate_is_sane_at_the_extremes(warmup, steps):
+    params = TrainHeadParams(warmup_steps=warmup, max_steps=steps, min_lr_fraction=0)
+    rates = [schedule(step, params) for step in range(steps)]
+    assert min(rates) >= 0
+    assert max(rates) == 1.0
 
 
 def test_every_group_has_its_own_peak_and_decay():
     params = TrainHeadParams(lr=1e-3, weight_decay=0.1)
     toy = Toy()
     toy.embedding.requires_grad_(False)
-    optimizer = make_optimizer(toy, params, {"linear.weight": 0.5, "linear.bias": 0.5})
+    optimizer = make_optimizer(toy, params, {"linear.weight": 0.5, "linear.bias": 0.5}.get)
     found = {
         name: (group["peak_lr"], group["weight_decay"])
         for group in optimizer.param_groups
@@ -130,11 +96,11 @@ def test_the_optimizer_goes_on_where_it_was():
 
     torch.manual_seed(0)
     through = Toy()
-    optimizer = make_optimizer(through, params, {})
+    optimizer = make_optimizer(through, params, lambda name: None)
     steps(through, optimizer, 3)
     stopped = Toy()
     stopped.load_state_dict(through.state_dict())
-    resumed = make_optimizer(stopped, params, {})
+    resumed = make_optimizer(stopped, params, lambda name: None)
     restore_optimizer(resumed, stopped, optimizer_tensors(optimizer, through))
     steps(through, optimizer, 4)
     steps(stopped, resumed, 4)

@@ -9,26 +9,19 @@ import torch
 from pipeline.base.errors import ConfigError
 from pipeline.store import FeatureStore
 from pipeline.train.loop import Trainer
-from pipeline.train.process_group import ProcessGroup
-from pipeline.train.sampling import Plan, StepPart
+from pipeline.train.sampling import Plan
 from pipeline.train.split import split_by_episode
-
-ALONE = ProcessGroup()
 
 
 @pytest.fixture
 def plan(store, params):
-    """`plan(processes, key=value, ...)`: the plan of small params."""
+    """`plan(key=value, ...)`: the plan of small params."""
 
-    def make(processes: ProcessGroup = ALONE, store: FeatureStore = store, **changed: Any) -> Plan:
+    def make(**changed: Any) -> Plan:
         made = params(**changed)
-        return Plan(store, made, split_by_episode(store, made.split, made.horizon), processes)
+        return Plan(store, made, split_by_episode(store, made.split, made.horizon))
 
     return make
-
-
-def described(parts: list[StepPart]) -> list[tuple[Any, ...]]:
-    return [(part.ticks.tolist(), part.share, part.seed) for part in parts]
 
 
 @pytest.mark.parametrize("parts", [3, 8])
@@ -45,14 +38,6 @@ def test_parts_are_the_whole(store, plan, parts):
             assert part.share == pytest.approx(float(here / valid))
 
 
-def test_processes_share_the_parts_of_one_that_accumulates(plan):
-    alone = plan(grad_accumulation=4)
-    together = [plan(ProcessGroup(rank, 2), grad_accumulation=2) for rank in range(2)]
-    for step in (0, 1, 17):
-        apart = [part for each in together for part in each.step(step)]
-        assert described(apart) == described(alone.step(step))
-
-
 def test_seeds_differ_by_step_and_part(plan):
     cut = plan(grad_accumulation=4)
     seeds = [part.seed for step in range(20) for part in cut.step(step)]
@@ -60,18 +45,11 @@ def test_seeds_differ_by_step_and_part(plan):
     assert {part.seed for part in plan(grad_accumulation=4, seed=1).step(0)}.isdisjoint(seeds)
 
 
-def test_with_a_terminal_stop_every_step_counts(plan):
-    for part in plan(grad_accumulation=4, terminal_stop=True, horizon=20).step(3):
-        assert part.share == pytest.approx(1 / 4)
-
-
 def test_fewer_ticks_than_parts_are_refused(store, params, plan):
-    with pytest.raises(ConfigError, match=r"8 parts of a step \(4 process\(es\) x"):
-        plan(ProcessGroup(0, 4), batch_size=7, grad_accumulation=2)
-    made = params(batch_size=7, grad_accumulation=2)
+    made = params(batch_size=7, grad_accumulation=8)
     split = split_by_episode(store, made.split, made.horizon)
-    with pytest.raises(ConfigError, match=r"^finetune\.batch_size is 7"):
-        Plan(store, made, split, ProcessGroup(0, 4), "finetune")
+    with pytest.raises(ConfigError, match=r"^finetune\.batch_size is 7.* of the 8 parts"):
+        Plan(store, made, split, "finetune")
 
 
 def test_variants_are_drawn_from_seed_and_step(store, plan, monkeypatch):

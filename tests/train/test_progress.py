@@ -1,12 +1,9 @@
 """A training is never silent for long, and says how fast it goes and what it lacks."""
 
-import csv
 import sys
 import time
 from dataclasses import replace
 from io import StringIO
-from itertools import count
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,7 +12,6 @@ import torch
 
 from pipeline.store import FeatureStore, episode_name
 from pipeline.train.batches import Prefetch, Windows
-from pipeline.train.log import speed_file
 from pipeline.train.progress import Progress, describe_data, peak_memory_bytes
 from pipeline.train.run import policy_shape
 from pipeline.train.split import Split
@@ -55,7 +51,7 @@ def test_without_a_terminal_a_line_a_minute(clock, capsys):
             for _ in range(2):
                 clock[0] += 5
                 progress.advance()
-            progress.show(progress.read(), 0.25, 1e-3)
+            progress.show(0.25, 1e-3)
     out, err = capsys.readouterr()
     assert out == ""
     assert err.splitlines()[:2] == [
@@ -75,11 +71,12 @@ def test_on_a_terminal_a_bar_with_the_loss(store, params, trainer, clock, monkey
     assert "train loss" not in shown
 
 
-def test_pauses_are_not_counted(monkeypatch):
+def test_pauses_are_not_counted(monkeypatch, capsys):
     now = [100.0]
     monkeypatch.setattr(time, "perf_counter", lambda: now[0])
+    monkeypatch.setattr("pipeline.train.progress.EVERY_S", 1.0)
     feed = Waiting()
-    progress = Progress(feed, CPU, range(10, 100), trained_s=50.0, shown=False)
+    progress = Progress(feed, CPU, range(10, 100), trained_s=50.0)
     now[0] += 4
     with progress.paused():
         now[0] += 1000
@@ -88,37 +85,14 @@ def test_pauses_are_not_counted(monkeypatch):
     feed.waited_s = 2.0
     for _ in range(10):
         progress.advance()
-    pace = progress.read()
-    assert (pace.steps_per_s, pace.data_wait_share, pace.trained_s) == (2.0, 0.4, 55.0)
-    now[0] += 10
-    progress.advance()
-    assert progress.read()[:2] == (0.1, 0.0)
+    progress.show(0.5, 1e-3)
+    assert progress.trained_s == 55.0
+    assert "2 steps/s" in capsys.readouterr().err
 
 
 def test_peak_memory_is_at_least_what_was_held():
     held = torch.ones(64 * 2**20 // 4)
     assert peak_memory_bytes(CPU) > held.nbytes
-
-
-def test_the_log_has_speed_memory_and_time_over_all_starts(
-    store, params, trainer, monkeypatch, capsys
-):
-    readings = count()  # every look at the clock takes a thousandth of a second
-    monkeypatch.setattr("pipeline.train.progress.time.perf_counter", lambda: next(readings) / 1000)
-    begun = trainer(store, params(max_steps=30))
-    begun._trained_s = 1000.0
-    begun.fit()
-    with speed_file(Path(params().logs)).open() as file:
-        rows = list(csv.DictReader(file, delimiter="\t"))
-    assert [row["step"] for row in rows] == ["10", "20", "30"]
-    seconds = [float(row["trained_s"]) for row in rows]
-    assert 1000 < seconds[0] < seconds[1] < seconds[2] < 1060
-    assert all(float(row["peak_memory_mib"]) > 50 for row in rows)
-    assert all(float(row["steps_per_s"]) > 0 for row in rows)
-    said = capsys.readouterr().out.splitlines()[-1]
-    assert said.startswith("trained 30 steps in 16.7 min (0.0 steps/s)")
-    assert "steps/s), peak memory" in said
-    assert said.endswith((" MiB", " GiB"))
 
 
 def test_groups_that_were_cut_by_time_count_once(store, params):
@@ -127,21 +101,6 @@ def test_groups_that_were_cut_by_time_count_once(store, params):
     shape = policy_shape(store, fit_normalization(store, thirds[0], WINDOWS))
     lines = describe_data(store, shape, params(), Split(*thirds, named, None))
     assert lines[1].endswith("of 1 + 1 + 1 groups (1 in all, cut by time)")
-    assert not any("five folds" in line for line in lines), "one recording has no folds"
-
-
-def test_one_test_group_of_several_is_too_few_for_an_interval(store, params):
-    """Episodes of 30 ticks, each a group."""
-    shape = policy_shape(store, fit_normalization(store, np.arange(30), WINDOWS))
-    named = {episode_name(episode): episode_name(episode) for episode in store.episodes}
-    few = Split(np.arange(30), np.arange(30, 60), np.arange(60, 90), named, None)
-    more = replace(few, test=np.arange(60, 120))
-    folds = params(split={"folds": 4})
-    said = [
-        "no interval; five folds test each" in "".join(describe_data(store, shape, *rest))
-        for rest in ((params(), few), (params(), more), (folds, few))
-    ]
-    assert said == [True, False, False]
 
 
 @pytest.fixture

@@ -7,10 +7,7 @@ import pytest
 import torch
 
 from pipeline.base.errors import CheckpointMismatch
-from pipeline.train.checkpoints import load_weights
-from pipeline.train.loop import Trainer
-from pipeline.train.process_group import ProcessGroup
-from pipeline.train.run import open_run
+from pipeline.train.loop import Trainer, load_weights
 
 STEPS = 4
 
@@ -37,7 +34,6 @@ def test_every_step_can_be_gone_on_from(store, params, trainer, tmp_path, monkey
         "eval_every": 2,
         "checkpoint_every": 1,
         "drop_sensor": 0.3,
-        "sensor_lr": 1e-3,
         "diffusion": {"sampling_steps": 2},
         "flow_matching": {"sampling_steps": 2},
     }
@@ -62,29 +58,6 @@ def test_every_step_can_be_gone_on_from(store, params, trainer, tmp_path, monkey
         for a, b in zip(weights(resumed), weights(whole), strict=True):
             assert torch.equal(a, b)
         assert resumed.stopping == whole.stopping
-
-
-@pytest.fixture(scope="module")
-def of_two_parts(store, params_below, trainer, tmp_path_factory):
-    """A finished run of two parts a step, to be copied."""
-    chosen = params_below(tmp_path_factory.mktemp("parts"), grad_accumulation=2, max_steps=2)
-    trainer(store, chosen).fit()
-    return chosen.output
-
-
-@pytest.mark.parametrize(
-    ("size", "accumulation", "status"), [(2, 1, "finished"), (1, 4, "new"), (2, 2, "new")]
-)
-def test_parts_may_be_shared_out_anew_but_not_cut_anew(
-    store, params, monkeypatch, of_two_parts, size, accumulation, status
-):
-    """What one process of two parts did is the run of two processes of one part, and no other."""
-    shutil.copytree(of_two_parts, params().output)
-    monkeypatch.setenv("WORLD_SIZE", str(size))
-    monkeypatch.setattr(ProcessGroup, "current", lambda: ProcessGroup(0, size))
-    given = params(grad_accumulation=accumulation, max_steps=2)
-    assert open_run(given, store).status == status
-    assert open_run(given, store, {"adapter": "another"}).status == "new"
 
 
 def test_weights_of_another_module_are_refused(tmp_path):

@@ -10,7 +10,6 @@ from pipeline.base.config import TrainHeadParams
 from pipeline.base.errors import ConfigError
 from pipeline.store import FeatureStore
 from pipeline.train.batches import Prefetch, Windows
-from pipeline.train.process_group import ProcessGroup
 from pipeline.train.sampling import Plan, TickSampler
 from pipeline.train.split import split_by_episode
 
@@ -105,14 +104,14 @@ def test_each_sample_has_a_lag_of_its_own_and_the_same_after_a_stop(tiny_store, 
     store = FeatureStore.open(tiny_store(tmp_path))
     params = TrainHeadParams(batch_size=64, feature_lag=2, sensor_lag_s=0.3)
     split = split_by_episode(store, params.split)
-    plan = Plan(store, params, split, ProcessGroup())
+    plan = Plan(store, params, split)
     parts = [plan.step(step)[0] for step in range(20)]
     rows = np.concatenate([part.lags.features for part in parts])
     late_s = np.concatenate([part.lags.sensor_s for part in parts])
     assert np.bincount(rows) == pytest.approx([len(rows) / 3] * 3, rel=0.15)
     assert 0 <= late_s.min() < 0.01
     assert 0.29 < late_s.max() <= 0.3
-    again = Plan(store, params, split, ProcessGroup()).step(7)[0]
+    again = Plan(store, params, split).step(7)[0]
     assert np.array_equal(again.lags.features, parts[7].lags.features)
     assert np.array_equal(again.lags.sensor_s, parts[7].lags.sensor_s)
     # What a policy sees is so late: the next batch of a feed is that of the plan.

@@ -5,13 +5,12 @@ import json
 import shlex
 from collections.abc import Iterator, Sequence
 from copy import deepcopy
-from difflib import get_close_matches
 from itertools import islice
 from pathlib import Path
-from typing import Any, ClassVar, TypeVar, get_args
+from typing import Any, ClassVar, TypeVar
 
 import yaml
-from pydantic import BaseModel, ValidationError, model_validator
+from pydantic import ValidationError
 from pydantic.fields import FieldInfo
 
 from pipeline.base.border import Border, named, problems, shown
@@ -62,15 +61,6 @@ class Params(Section):
     push: PushParams = PushParams()
     inspect: InspectParams = InspectParams()
 
-    @model_validator(mode="after")
-    def _mixture_names_sources(self) -> "Params":
-        names = [source.name for source in self.data.sources]
-        unknown = sorted(set(self.train_head.mixture) - set(names))
-        if unknown and self.train_head.store is None:
-            mixture, there = ", ".join(unknown), ", ".join(names)
-            raise ValueError(f"train_head.mixture names {mixture}, but data.sources has {there}")
-        return self
-
 
 def described_keys(sections: Sequence[str]) -> list[str]:
     """Every key of these sections: a line with its default, then its meaning."""
@@ -119,11 +109,6 @@ _REPLACED = {
     "train_head.val_fraction": "is no longer a key, because episodes are split three ways. Write "
     "train_head.split={val: 0.15, test: 0.15}: val chooses the checkpoint and stops early, test is "
     "what stages.evaluate reports on",
-    **dict.fromkeys(
-        ("export.int8", "export.int8_tolerance"),
-        "is no longer a key: a head in int8 was hardly faster and mostly refused, as 0.07 to 0.10 "
-        "training std off the policy. Remove it",
-    ),
 }
 """Keys of earlier versions, and their replacements."""
 
@@ -227,27 +212,7 @@ def _as_section(document: dict[str, Any], section: type[_Section], where: str) -
         lines = [f"{named(where)}: {error.error_count()} problem(s)"]
         for place, why in islice(problems(error), _MOST_PROBLEMS):
             if why.startswith("unknown key"):
-                why = _REPLACED.get(place) or _unknown_key(place.split("."), section)
+                why = _REPLACED.get(place, "unknown key; --keys lists those that there are")
             lines.append(f"  {place or section.__name__.lower()}: {why}")
         lines.append(f"Correct {'it' if len(lines) == 2 else 'them'}, and run the same again.")
         raise ConfigError("\n".join(lines)) from None
-
-
-def _unknown_key(place: Sequence[str], root: type[BaseModel]) -> str:
-    """The key that was likely meant, or else all keys of the section."""
-    section: Any = root
-    for part in place[:-1]:
-        if part in section.model_fields:
-            section = _section_in(section.model_fields[part].annotation)
-    known = list(section.model_fields)
-    if meant := get_close_matches(place[-1], known, n=1):
-        return f"unknown key; did you mean {meant[0]}?"
-    return f"unknown key; expected one of: {', '.join(known)}"
-
-
-def _section_in(annotation: Any) -> Any:
-    """The section type of a field, or of its tuple's entries."""
-    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
-        return annotation
-    inside = map(_section_in, get_args(annotation))
-    return next((section for section in inside if section is not None), None)

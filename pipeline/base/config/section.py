@@ -28,14 +28,8 @@ def _without_home(paths: _Paths) -> _Paths:
     return paths
 
 
-def _bounded(path: Path) -> Path:
-    if len(str(path)) > 3000 or any(len(os.fsencode(part)) > 200 for part in path.parts):
-        raise ValueError("expected a path of at most 3,000 characters, a name of at most 200 bytes")
-    return path
-
-
-Place = Annotated[Path, AfterValidator(_without_home), AfterValidator(_bounded)]
-"""A file or folder; its name is short enough for the suffixes of files beside it."""
+Place = Annotated[Path, AfterValidator(_without_home)]
+"""A file or folder."""
 PathOrName = Annotated[str, AfterValidator(_without_home)]
 """A path or a hub id."""
 Globs = Annotated[str | tuple[str, ...], AfterValidator(_without_home)]
@@ -53,15 +47,6 @@ Output = Annotated[Place, AfterValidator(_is_apart)]
 """A folder that a command writes."""
 
 
-def _keeps_truth(value: Any, parsed: Any) -> bool:
-    """Whether no true or false was turned into a number."""
-    if isinstance(value, dict) and isinstance(parsed, dict):
-        return all(_keeps_truth(inner, parsed.get(key)) for key, inner in value.items())
-    if isinstance(value, list | tuple) and isinstance(parsed, list | tuple):
-        return all(map(_keeps_truth, value, parsed))
-    return isinstance(parsed, bool) or not isinstance(value, bool)
-
-
 class Section(BaseModel):
     """Base of every section: immutable, no unknown keys, no NaN or infinity."""
 
@@ -72,6 +57,7 @@ class Section(BaseModel):
     @field_validator("*", mode="wrap")
     @classmethod
     def _no_truth_for_a_number(cls, value: Any, parse: ValidatorFunctionWrapHandler) -> Any:
-        if not _keeps_truth(value, parsed := parse(value)):
+        parsed = parse(value)
+        if isinstance(value, bool) and not isinstance(parsed, bool):
             raise ValueError("expected a number, found true or false")
         return parsed

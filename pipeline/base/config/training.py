@@ -235,27 +235,18 @@ class TrainHeadParams(Section):
     sensor_lag_s: float = Field(default=0.0, ge=0, le=3600)
     """Most seconds that the sensor is late in training, drawn in the same way; its window then
     reaches back by so much more."""
-    terminal_stop: bool = False
-    """After an episode's end, train the policy to stand still (zero deltas and velocities, the last
-    absolute action). Otherwise those steps of the chunk are left out of the loss."""
     batch_size: int = Field(default=64, ge=1, le=2**16)
-    """Ticks per step, over all accumulated parts and all processes."""
+    """Ticks per step, over all accumulated parts."""
     grad_accumulation: int = Field(default=1, ge=1, le=2**16)
-    """Parts of a step's ticks that each process computes one after the other."""
+    """Parts of a step's ticks that are computed one after the other."""
     max_steps: int = Field(default=500, ge=1, le=10**9)
-    """Steps of the run; the learning rate's decay ends there."""
-    lr_schedule: Literal["cosine", "trapezoid", "constant"] = "cosine"
-    """After the warm-up: half a cosine to the floor; flat, then linear to it; or flat."""
-    decay_fraction: Fraction = 0.2
-    """For `trapezoid`: share of all steps that its final decay takes."""
+    """Steps of the run, over which the learning rate falls along half a cosine."""
     warmup_steps: int = Field(default=100, ge=0, le=10**9)
     """Steps of linear warm-up."""
     lr: float = Field(default=5e-4, gt=0, le=1e3)
     """Peak learning rate of AdamW."""
-    sensor_lr: float | None = Field(default=None, gt=0, le=1e3)
-    """Peak learning rate of the sensor encoder; null: `lr`."""
     min_lr_fraction: Fraction = 0.05
-    """Learning rate at the end of the decay, as a share of the peak."""
+    """Learning rate at the last step, as a share of the peak; 1 keeps the peak."""
     weight_decay: float = Field(default=0.01, ge=0, le=1e3)
     """Weight decay of matrices; norms, biases and embeddings have none."""
     grad_clip: float = Field(default=1.0, gt=0, le=1e9)
@@ -264,8 +255,6 @@ class TrainHeadParams(Section):
     """Decay of the moving average of weights, which is evaluated and kept."""
     amp: Literal["auto", "off", "bfloat16"] = "auto"
     """bfloat16 autocast; `auto` uses it if a CUDA device supports it."""
-    compile: bool = False
-    """Compile the policy with torch.compile: slow to start, then faster steps."""
     group_weights: dict[Literal["translation", "rotation", "gripper", "other"], Weight] = Field(
         default_factory=dict
     )
@@ -280,9 +269,6 @@ class TrainHeadParams(Section):
     """
     eval_every: int = Field(default=50, ge=1, le=10**9)
     """Steps between evaluations on the ticks of val."""
-    eval_samples: int = Field(default=1, ge=1, le=1000)
-    """Chunks sampled per tick; the error of one chunk is averaged over them. Experts that do not
-    sample give one."""
     early_stopping: int | None = Field(default=None, ge=1, le=10**9)
     """Stop after this many evaluations in a row without a better one; null never stops early."""
     checkpoint_every: int = Field(default=200, ge=1, le=10**9)
@@ -291,9 +277,6 @@ class TrainHeadParams(Section):
     """Seed of weights, order and dropout."""
     device: str = "auto"
     """auto, cpu, cuda or cuda:N."""
-    feed: Literal["auto", "mapped", "device"] = "auto"
-    """How batches are made. mapped: gathered from the mapped store. device: gathered on the device,
-    which holds the streams that fit. `auto` chooses and prints why."""
     check_store: bool = True
     """Read the whole store once before training or tuning, and refuse a chunk that does not give
     its checksum; false skips this, where it takes too long."""
@@ -308,9 +291,8 @@ class TrainHeadParams(Section):
     """Folder of the curves."""
     loggers: tuple[LoggerName, ...] = ()
     """Tools that show the curves during training, besides the files that DVC plots. tensorboard:
-    event files in `<logs>.tensorboard`. wandb: Weights & Biases."""
-    wandb_project: str = "vla-feature-cache"
-    """Project of the run in Weights & Biases; its own environment variables decide the rest."""
+    event files in `<logs>.tensorboard`. wandb: Weights & Biases, whose own environment variables,
+    such as WANDB_PROJECT, decide the rest."""
 
     @field_validator("anchor", mode="before")
     @classmethod

@@ -51,7 +51,7 @@ def weights(module: nn.Module) -> dict[str, torch.Tensor]:
 def test_all_that_learns_does_at_its_own_rate_and_the_loss_falls(params):
     still = {"dim": 16, "layers": 1, "heads": 2, "dropout": 0.0}
     given = params(
-        train_head={"expert": still, "lr_schedule": "constant"},
+        train_head={"expert": still, "min_lr_fraction": 1.0},
         finetune={"batch_size": 8, "max_steps": 24, "eval_every": 24, "checkpoint_every": 24},
     )
     made = trainer(given)

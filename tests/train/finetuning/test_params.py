@@ -8,12 +8,11 @@ from pipeline.train.finetuning import head_params
 
 
 def test_finetune_is_laid_over_train_head(params):
-    given = params(train_head={"batch_size": 99, "seed": 3, "drop_features": 0.2, "compile": True})
+    given = params(train_head={"batch_size": 99, "seed": 3, "drop_features": 0.2})
     head = head_params(given)
     assert (head.batch_size, head.max_steps, head.eval_every) == (6, 5, 3)
     assert (head.output, head.logs) == (given.finetune.output, given.finetune.logs)
     assert (head.seed, head.drop_features, head.lr) == (3, 0.2, given.train_head.lr)
-    assert not head.compile, "rows are no tensors"
 
 
 @pytest.mark.parametrize(
