@@ -260,13 +260,7 @@ def remote(params: Params) -> Generator[Callable[[], PolicySession]]:
         serving = next((line for line in server.stdout if line.startswith(SERVING)), None)
         if serving is None:
             raise RuntimeError(f"{' '.join(command)}: ended before it served")
-        client = leaving.enter_context(PolicyClient(serving.split()[1]))
-
-        def connect() -> PolicyClient:
-            client.reconnect()
-            return client
-
-        yield connect
+        yield lambda: leaving.enter_context(PolicyClient(serving.split()[1]))
 
 
 @contextmanager

@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from queue import Empty, SimpleQueue
 from typing import Any
 
-from pipeline.base.errors import ConfigError, ServerBusy
+from pipeline.base.errors import ConfigError
 from pipeline.robot.loop import SafeStop, StopKind
 
 Answer = Mapping[str, Any]
@@ -47,23 +47,18 @@ class PolicyThread:
     def take(self) -> Answer | None:
         """The answer if it has come, else None.
 
-        Raises `SafeStop` if the policy failed, and `ServerBusy` if the server does not answer this
-        question.
+        Raises `SafeStop` if the policy failed.
         """
         try:
             self.took_s, answer = self._answers.get_nowait()
         except Empty:
             return None
         stale, self.busy, self._stale = self._stale, False, False
-        if isinstance(answer, Exception) and not isinstance(answer, ServerBusy):
+        if isinstance(answer, Exception):
             lost = isinstance(answer, ConnectionError)
             kind = StopKind.CONNECTION if lost else StopKind.POLICY
             raise SafeStop(kind, f"{kind.value}: {type(answer).__name__}: {answer}") from answer
-        if stale:
-            return None
-        if isinstance(answer, ServerBusy):
-            raise answer
-        return answer
+        return None if stale else answer
 
     def close(self) -> None:
         """Ask no more; wait for an awaited answer, but at most 5 s."""

@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.base.config import Chunking
-from pipeline.base.errors import ConfigError, ServerBusy
+from pipeline.base.errors import ConfigError
 from pipeline.robot.limits import Limits
 from pipeline.robot.loop import ControlLoop, Executor, SafeStop, StopKind
 from pipeline.robot.process import PolicyThread, Watchdog, ended_by_hand, stop_firmly, undisturbed
@@ -294,13 +294,7 @@ class _Run:
 
     def take_answer(self) -> None:
         """Plan the chunk of an answer, where one has come."""
-        try:
-            answer = self.policy.take()
-        except ServerBusy:
-            answer = None
-            self.report.busy += 1
-            self.loop.refused()
-        if answer is None:
+        if (answer := self.policy.take()) is None:
             first_s, waited_s = self.settings.first_answer_s, time.monotonic() - self.begun_s
             if not self.loop.executor.planned and waited_s > first_s:
                 raise SafeStop(StopKind.NO_CHUNK, f"no first chunk within {first_s:g} s")

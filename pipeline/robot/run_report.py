@@ -123,8 +123,6 @@ class RunReport:
         """For each tick with an action: its number, the robot's time, and the action."""
         self.ticks = self.left_out = self.missed_ticks = 0
         """Ticks that were run, ticks skipped because one before took too long, and late ticks."""
-        self.busy = 0
-        """Questions that the policy's server was too busy to answer; it took their readings."""
         self.dropped_readings = 0
         """Readings that came between two questions and are older than a policy's window holds."""
         self.old_features = 0

@@ -20,7 +20,7 @@ import numpy as np
 import pytest
 
 from pipeline.base.config import LimitsFile
-from pipeline.base.errors import ConfigError, ServerBusy
+from pipeline.base.errors import ConfigError
 from pipeline.robot.limits import Limits
 from pipeline.robot.loop import StopKind
 from pipeline.robot.realtime import RunSettings, run_robot
@@ -416,30 +416,6 @@ STOPS: dict[str, Callable[[], RunReport]] = {
 @pytest.mark.parametrize("stop", STOPS.values(), ids=STOPS)
 def test_whatever_goes_wrong_stops_the_robot(stop: Callable[[], RunReport]) -> None:
     stop()
-
-
-def test_a_busy_server_is_asked_again_with_its_frames_and_the_readings_that_follow() -> None:
-    def busy(n: int, answer: Observed) -> None:
-        if n in (1, 8, 9):
-            raise ServerBusy("busy: 8 observations are waiting")
-
-    arm, brain = Arm(after(60, put("ended", "enough"))), Brain(busy)
-    report = run_robot(arm, brain, replace(CALM, seconds=20))
-    assert (report.kind, report.busy) == (StopKind.ENDED, 3) and arm.acts
-    assert "images/View1" in brain.asked[0] and "images/View1" in brain.asked[1]
-    states = np.concatenate([asked["state"][:, 0] for asked in brain.asked])
-    np.testing.assert_array_equal(states, np.repeat(np.arange(len(states) / 2), 2))
-
-
-def test_a_server_that_stays_busy_stops_the_robot() -> None:
-    def busy(n: int, answer: Observed) -> None:
-        if n > since:
-            raise ServerBusy("busy: 8 observations are waiting")
-
-    since = 0
-    stopped(Arm(), StopKind.NO_CHUNK, "first chunk", Brain(busy), first_answer_s=0.1)
-    since = 5
-    stopped(Arm(), StopKind.NO_CHUNK, "used up", Brain(busy))
 
 
 def without_sensor(observed: Observed) -> None:

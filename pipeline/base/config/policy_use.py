@@ -141,21 +141,11 @@ class ServeParams(Section):
     seed: Seed = 0
     """Seed of a policy's draws for a robot that sends no seed."""
     max_connections: int = Field(default=8, ge=1, le=10_000)
-    """Most robots at a time."""
-    max_waiting: int = Field(default=8, ge=1, le=10_000)
-    """Most observations that are being answered or wait; one more is refused as busy."""
+    """Most robots at a time; each has one observation that is being answered or waits."""
     max_message_mb: int = Field(default=64, ge=1, le=1024)
     """Largest size of one observation, in MiB."""
     idle_s: float = Field(default=600.0, gt=0, le=1e6)
     """Seconds after which a connection without a complete message is closed."""
-    transform: Literal["aloha", "droid", "libero"] | None = None
-    """Take observations by the names that openpi's clients of this robot give. Their images are
-    the policy's views in this order. aloha: `images/cam_high`, `cam_left_wrist`,
-    `cam_right_wrist`, `cam_low`; `state`. droid: `observation/exterior_image_1_left`,
-    `wrist_image_left`; the state is `joint_position` and `gripper_position`. libero:
-    `observation/image`, `wrist_image`; `observation/state`."""
-    log: Literal["text", "json"] = "text"
-    """How the line of each connection, episode, slow answer, warning and refusal is written."""
 
 
 class DriveParams(Section):
