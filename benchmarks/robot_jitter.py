@@ -153,7 +153,7 @@ def main() -> None:
     parser.add_argument("--processes", type=int, nargs="+", choices=(1, 2), default=[1, 2])
     parser.add_argument("--params", type=Path, default=Path("params.yaml"))
     parser.add_argument("--checkpoint", type=Path, help="a trained policy; else an untrained one")
-    parser.add_argument("--fifo", type=int, default=0, help="priority of the loop, from 2")
+    parser.add_argument("--fifo", type=int, default=0, help="priority of the loop, from 1")
     parser.add_argument("--results", type=Path, help="folder of the picture; else none is drawn")
     options = parser.parse_args()
     torch.set_num_threads(1)
@@ -172,7 +172,7 @@ def main() -> None:
             with (local if processes == 1 else remote)(params) as connect, first(options.fifo):
                 for hz in rates:
                     name = f"{processes} process{'es' if processes > 1 else ''}, {hz:g} Hz"
-                    settings = RunSettings(INSTRUCTION, hz=hz, fifo_priority=options.fifo)
+                    settings = RunSettings(INSTRUCTION, hz=hz)
                     courses[name] = run(connect, settings, seconds)
                     tell(name, courses[name])
     finally:
@@ -265,10 +265,10 @@ def remote(params: Params) -> Generator[Callable[[], PolicySession]]:
 
 @contextmanager
 def first(priority: int) -> Generator[None]:
-    """All threads that begin within this go before other processes, as under `chrt -f 1`."""
+    """This thread, and those that begin within this, go before others, as under `chrt -f`."""
     before = os.sched_getscheduler(0), os.sched_getparam(0)
     if priority:
-        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
     try:
         yield
     finally:

@@ -37,7 +37,6 @@ from pipeline.robot.run_report import (
     RunReport,
     TickPart,
     TickTimer,
-    allowed_ms,
 )
 
 if TYPE_CHECKING:  # It writes images and parquet, which the loop does not need.
@@ -97,9 +96,6 @@ class RunSettings:
     """How long; None: until something ends it."""
     seed: int | None = None
     """Seeds the samples that the policy draws."""
-    clock_offset_s: float | None = None
-    """The robot's clock less `time.monotonic()`; None: the quickest of the first observations gives
-    it."""
     clock_drift_s: float = 0.1
     """How far the robot's clock may leave its offset, and a reading lie in the future."""
     first_answer_s: float = 60.0
@@ -116,11 +112,6 @@ class RunSettings:
     """Ticks left out, with none in time between them, at which the robot stops."""
     hung_s: float = 0.5
     """How long a tick may take, at least two and a half ticks, before the watchdog stops it."""
-    fifo_priority: int = 0
-    """2 to 99: the loop's thread goes before whatever has less (SCHED_FIFO of Linux), and the
-    policy's thread has one less; needs the right to (`ulimit -r`, or root). 0 leaves both as they
-    are. Start the whole process under `chrt -f 1`: a thread that holds Python while another process
-    has its core keeps the loop waiting."""
 
 
 def run_robot(
@@ -137,10 +128,10 @@ def run_robot(
     ends the run. Nobody stops the robot where the process is killed (SIGKILL, no memory, no power):
     its own controller must, when no action comes.
 
-    Raises `ConfigError` before the first observation where settings do not fit the policy, the
-    limits or the machine.
+    Raises `ConfigError` before the first observation where settings do not fit the policy or the
+    limits.
     """
-    with undisturbed(settings.fifo_priority), ended_by_hand() as signals:
+    with undisturbed(), ended_by_hand() as signals:
         run = _Run(robot, policy, settings, limits, recorder)
         report = run.report
         try:
@@ -194,7 +185,7 @@ class _Run:
         )
         reuse = max(1, round(meta["vlm_reuse_count"] * self.hz / meta["action_hz"]))
         self.loop = ControlLoop(executor, reuse, meta["uses_features"])
-        self.policy = PolicyThread(policy.infer, settings.fifo_priority - 1)
+        self.policy = PolicyThread(policy.infer)
         self.looks_at = set(meta["looks_at"]) - {"features"}
         self.pending = {
             name: PendingReadings(
@@ -203,8 +194,8 @@ class _Run:
             for name in sorted(self.looks_at | (limits.streams if limits else set()))
         }
         self.watched = tuple(self.pending) if settings.watch is None else settings.watch
-        self.clock = RobotClock(settings.clock_offset_s, settings.clock_drift_s)
-        self.report = RunReport(meta["action_dim"])
+        self.clock = RobotClock(settings.clock_drift_s)
+        self.report = RunReport()
         self.timer, self.missed_in_a_row = TickTimer(), 0
         self.unrecorded: tuple[Mapping[str, Any], NDArray[np.float64] | None] | None = None
         self.begin_episode()
@@ -219,7 +210,7 @@ class _Run:
             self.timer.begin(deadline)
             if self.settings.seconds is not None and tick >= self.settings.seconds * self.hz:
                 raise SafeStop(StopKind.TIME, f"{self.settings.seconds:g} s are over")
-            self.tick(tick)
+            self.tick()
             ended = self.timer.end()
             self.report.tick_timings.note(self.timer.row_ms())
             self.report.ticks += 1
@@ -231,7 +222,7 @@ class _Run:
                 self.missed_in_a_row = 0
             tick = following
 
-    def tick(self, tick: int) -> None:
+    def tick(self) -> None:
         """Observe, check, take an answer, ask, act, record."""
         self.timer.mark("observe")
         observed = self.robot.observe()
@@ -247,7 +238,7 @@ class _Run:
         if self.loop.chunk_due and not self.policy.busy:
             self.ask()
         self.timer.mark("plan")
-        self.act(tick, observed)
+        self.act(observed)
         self.record()
         self.watchdog.beat()
         self.watchdog.check()
@@ -358,23 +349,9 @@ class _Run:
         self.frames_s = max(frames[view][0] for view in self.views)
         return fields
 
-    def _answer_times(self) -> str:
-        """How long answers took, beside how long they may take."""
-        took = self.report.answer_timings.document().get(ANSWER_PARTS[0])
-        if took is None:
-            return ""
-        half_ms = allowed_ms(self.loop.executor.horizon, self.hz)
-        return (
-            f": answers took {took['p50']:.0f} ms (median), {took['max']:.0f} ms at most; half of "
-            f"a chunk is {half_ms:.0f} ms"
-        )
-
-    def act(self, tick: int, observed: Mapping[str, Any]) -> None:
+    def act(self, observed: Mapping[str, Any]) -> None:
         """Send this tick's action within the limits; nothing before the first chunk."""
-        try:
-            action = self.loop.action()
-        except SafeStop as stop:
-            raise SafeStop(stop.kind, f"{stop}{self._answer_times()}") from None
+        action = self.loop.action()
         if action is not None:
             age_s = self.now_s - self.features_s if self.views else 0.0
             if not age_s <= self.settings.old_features_s:
@@ -389,7 +366,6 @@ class _Run:
             self.timer.mark("act")
             self.unrecorded = observed, action
             self.robot.act(action)
-            self.report.sent.note((tick, self.now_s, *action))
 
     def record(self) -> None:
         """Give the recorder this tick, once: at its end, or where it has stopped the robot."""
@@ -431,7 +407,5 @@ class _Run:
             failed = f"the last tick is not recorded: {traceback.format_exc()}"
         self.watchdog.close()
         self.policy.close()
-        self.report.dropped_readings = sum(self.pending[name].dropped for name in self.looks_at)
         self.report.clipped = self.limits.clipped if self.limits else 0
-        self.report.clock_offset_s = self.clock.offset_s
         return self.watchdog.failed + failed
