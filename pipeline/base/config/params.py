@@ -119,11 +119,6 @@ _REPLACED = {
     "train_head.val_fraction": "is no longer a key, because episodes are split three ways. Write "
     "train_head.split={val: 0.15, test: 0.15}: val chooses the checkpoint and stops early, test is "
     "what stages.evaluate reports on",
-    **dict.fromkeys(
-        ("export.int8", "export.int8_tolerance"),
-        "is no longer a key: a head in int8 was hardly faster and mostly refused, as 0.07 to 0.10 "
-        "training std off the policy. Remove it",
-    ),
 }
 """Keys of earlier versions, and their replacements."""
 
