@@ -298,7 +298,9 @@ def test_a_file_that_is_off_is_refused_and_the_old_one_stays(tmp_path, monkeypat
         return lambda given: run(given) + np.float32(0.01)
 
     monkeypatch.setattr(export, "torch_runner", off)
-    with pytest.raises(NumericsError, match=r"at most 0.0001 training std.*found 0.0084 over random inputs"):
+    with pytest.raises(
+        NumericsError, match=r"at most 0.0001 training std.*found 0.0084 over random inputs"
+    ):
         exported(folder, checkpoint, "torch")
     assert (folder / "head.pt2").read_bytes() == before
     assert not folder.with_name("head.new").exists()
