@@ -17,7 +17,7 @@ import tempfile
 from collections import Counter
 from collections.abc import Callable, Generator, Mapping
 from contextlib import ExitStack, closing, contextmanager
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -103,7 +103,6 @@ class Course:
     answers: Timings = field(default_factory=lambda: Timings(ANSWER_PARTS, _LONGEST_TICKS))
     stops: Counter[str] = field(default_factory=Counter[str])
     left_out: int = 0
-    missed: list[dict[str, Any]] = field(default_factory=list[dict[str, Any]])
     missed_ticks: int = 0
     unaccounted: float = 0.0
     """The most of a run."""
@@ -117,7 +116,6 @@ class Course:
             self.answers.note(row)
         self.left_out += run.left_out
         self.missed_ticks += run.missed_ticks
-        self.missed += map(asdict, run.missed)
         safe_stop = run.kind != StopKind.TIME
         unaccounted = robot.unaccounted(run.left_out, safe_stop)
         self.unaccounted = max(self.unaccounted, abs(unaccounted))
@@ -141,7 +139,6 @@ class Course:
             "episodes": dict(self.episodes),
             "tick_ms": self.ticks.document(),
             "answer_ms": self.answers.document(),
-            "worst": sorted(self.missed, key=lambda tick: -tick["late_ms"])[:20],
         }
 
 

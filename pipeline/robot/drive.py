@@ -189,7 +189,7 @@ def _tell(report: RunReport, say: Callable[[str], None]) -> None:
         for line in timings.table().text():
             say(line)
     counts = f"{report.ticks} ticks, {report.missed_ticks} late, {report.answers} answers"
-    say(f"{counts}, {report.clipped} actions clipped, {report.old_features} of old features")
+    say(f"{counts}, {report.clipped} actions clipped")
     if report.recording is not None:
         say(f"recording: {report.recording} (python -m stages.inspect {report.recording})")
     if report.traceback:

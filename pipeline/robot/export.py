@@ -213,9 +213,9 @@ def onnx_session(path: Path, threads: int = 0) -> Any:
     return runtime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
 
 
-def onnx_runner(path: Path, threads: int = 0) -> Runner:
+def onnx_runner(path: Path) -> Runner:
     """Runs an ONNX file."""
-    session = onnx_session(path, threads)
+    session = onnx_session(path)
     return lambda given: session.run(None, {name: v.numpy() for name, v in given.items()})[0]
 
 

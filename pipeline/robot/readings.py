@@ -134,11 +134,6 @@ class SeenFeatures:
     """`row_key` of the frames and prompt; empty unless a session computed the features."""
 
 
-def older_than_trained(age_s: float, trained_age_s: float) -> bool:
-    """Whether features are older than any in training, by over 10 %: clocks are not exact."""
-    return age_s > 1.1 * trained_age_s
-
-
 class RobotMemory:
     """The windows of one robot by stream, and its newest features."""
 

@@ -30,10 +30,9 @@ from pipeline.base.errors import ConfigError
 from pipeline.robot.limits import Limits
 from pipeline.robot.loop import ControlLoop, Executor, SafeStop, StopKind
 from pipeline.robot.process import PolicyThread, Watchdog, ended_by_hand, stop_firmly, undisturbed
-from pipeline.robot.readings import PendingReadings, RobotClock, older_than_trained
+from pipeline.robot.readings import PendingReadings, RobotClock
 from pipeline.robot.run_report import (
     ANSWER_PARTS,
-    MissedTick,
     RunReport,
     TickPart,
     TickTimer,
@@ -176,7 +175,6 @@ class _Run:
                 f"limits: expected hz={self.hz:g}, the actions that the loop sends a second, found "
                 f"{limits.hz:g}. Make the limits with hz={self.hz:g}."
             )
-        self.trained_age_s = float(meta.get("trained_age_s", math.inf))
         self.chunk_shape = (meta["horizon"], meta["action_dim"])
         self.views = tuple(meta["streams"]["views"]) if meta["uses_features"] else ()
         moving = tuple(meta["moving"])
@@ -217,7 +215,7 @@ class _Run:
             following = tick + 1
             if ended > deadline + period:
                 following = max(following, math.ceil((ended - start) * self.hz))
-                self.miss(tick, ended - deadline - period, following - tick - 1)
+                self.miss(following - tick - 1)
             else:
                 self.missed_in_a_row = 0
             tick = following
@@ -298,9 +296,7 @@ class _Run:
             self.recorder.answer(answer)
             self.timer.mark("plan")
         if answer.get("feature_age_s") is not None:
-            age_s = float(answer["feature_age_s"])
-            self.features_s = self.asked_s - age_s
-            self.report.old_features += older_than_trained(age_s, self.trained_age_s)
+            self.features_s = self.asked_s - float(answer["feature_age_s"])
             if self.features_s >= self.frames_s - 1e-3:
                 self.loop.pass_ended()
         chunk = np.asarray(answer["actions"], np.float32)
@@ -374,11 +370,10 @@ class _Run:
             self.timer.mark("record")
             self.recorder.tick(*unrecorded)
 
-    def miss(self, tick: int, late_s: float, left_out: int) -> None:
+    def miss(self, left_out: int) -> None:
         """Count a late tick; stop where too many are left out while the robot moves."""
         seconds = self.timer.seconds
         part = max(seconds, key=seconds.__getitem__)
-        self.report.missed.append(MissedTick(tick, 1000 * late_s, part, left_out))
         self.report.missed_ticks += 1
         self.report.left_out += left_out
         self.missed_in_a_row += left_out

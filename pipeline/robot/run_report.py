@@ -2,9 +2,7 @@
 
 import math
 import time
-from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, get_args
 
@@ -89,19 +87,6 @@ class TickTimer:
         return [*(1000 * self.seconds.get(part, math.nan) for part in TICK_PARTS), 1000 * tick]
 
 
-@dataclass(frozen=True)
-class MissedTick:
-    """A tick that ended after the deadline of the next one."""
-
-    tick: int
-    late_ms: float
-    """After that deadline."""
-    part: str
-    """The part that took the most time."""
-    left_out: int
-    """Ticks after it that were not run."""
-
-
 class RunReport:
     """How a run went and why it ended; timings are of the newest `KEPT` ticks."""
 
@@ -109,11 +94,8 @@ class RunReport:
         self.kind, self.reason = StopKind.LOOP, "the process ends"
         self.tick_timings = Timings((*TICK_PARTS, "tick"), KEPT)
         self.answer_timings = Timings(ANSWER_PARTS, KEPT)
-        self.missed = deque[MissedTick](maxlen=KEPT)
         self.ticks = self.left_out = self.missed_ticks = 0
         """Ticks that were run, ticks skipped because one before took too long, and late ticks."""
-        self.old_features = 0
-        """Answers from features that were older than the policy was trained for."""
         self.clipped = 0
         """Ticks in which limits clipped the action."""
         self.recording: Path | None = None

@@ -169,15 +169,6 @@ def stopped(
     return report
 
 
-def test_a_report_counts_features_older_than_in_training() -> None:
-    brain = Brain(
-        lambda n, answer: answer.update(feature_age_s=0.5 if n in (3, 4) else 0.3),
-        trained_age_s=0.3,
-    )
-    report = run_robot(Arm(), brain, replace(CALM, seconds=2.0))
-    assert len(brain.asked) > 4 and report.old_features == 2
-
-
 def after(tick: int, do: Callable[[Observed], Any]) -> Callable[[int, Observed], None]:
     """From this tick on."""
     return lambda now, observed: do(observed) if now >= tick else None
@@ -414,12 +405,9 @@ def test_a_stream_that_limits_are_of_is_watched_whatever_the_policy_looks_at() -
     assert all("sensor" not in asked for asked in brain.asked)
 
 
-def test_one_slow_tick_is_counted_and_told_with_the_part_that_took_the_time() -> None:
+def test_one_slow_tick_is_counted() -> None:
     arm = Arm(moves=lambda tick: time.sleep(0.0525) if tick == 10 else None)
     report = run_robot(arm, Brain(), replace(CALM, missed_in_a_row=20))
-    (slow,) = report.missed
-    assert (slow.tick, slow.part, slow.left_out) == (11, "act", 10)
-    assert slow.late_ms == pytest.approx(47.5)
     assert (report.missed_ticks, report.left_out, report.ticks) == (1, 10, 50)
     assert len(arm.acts) == 49, "no two actions of one tick, and none of those left out"
 
