@@ -44,8 +44,7 @@ from pipeline.robot.live_features import LiveFeatures, prove
 from pipeline.robot.loop import ControlLoop, Executor, SafeStop, check_chunking
 from pipeline.robot.readings import RobotMemory, SeenFeatures
 from pipeline.robot.session import stack_guides
-from pipeline.simulation.environment import InsertionEnvironment
-from pipeline.simulation.environments import environment_maker
+from pipeline.simulation.environment import InsertionEnvironment, environment_maker
 from pipeline.simulation.interface import Action, EnvironmentRobot, RobotEnvironment, Shots
 
 SIDE_BY_SIDE: Final = 50
