@@ -17,7 +17,7 @@ import tempfile
 from collections import Counter
 from collections.abc import Callable, Generator, Mapping
 from contextlib import ExitStack, closing, contextmanager
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -103,7 +103,6 @@ class Course:
     answers: Timings = field(default_factory=lambda: Timings(ANSWER_PARTS, _LONGEST_TICKS))
     stops: Counter[str] = field(default_factory=Counter[str])
     left_out: int = 0
-    missed: list[dict[str, Any]] = field(default_factory=list[dict[str, Any]])
     missed_ticks: int = 0
     unaccounted: float = 0.0
     """The most of a run."""
@@ -117,7 +116,6 @@ class Course:
             self.answers.note(row)
         self.left_out += run.left_out
         self.missed_ticks += run.missed_ticks
-        self.missed += map(asdict, run.missed)
         safe_stop = run.kind != StopKind.TIME
         unaccounted = robot.unaccounted(run.left_out, safe_stop)
         self.unaccounted = max(self.unaccounted, abs(unaccounted))
@@ -141,7 +139,6 @@ class Course:
             "episodes": dict(self.episodes),
             "tick_ms": self.ticks.document(),
             "answer_ms": self.answers.document(),
-            "worst": sorted(self.missed, key=lambda tick: -tick["late_ms"])[:20],
         }
 
 
@@ -153,7 +150,7 @@ def main() -> None:
     parser.add_argument("--processes", type=int, nargs="+", choices=(1, 2), default=[1, 2])
     parser.add_argument("--params", type=Path, default=Path("params.yaml"))
     parser.add_argument("--checkpoint", type=Path, help="a trained policy; else an untrained one")
-    parser.add_argument("--fifo", type=int, default=0, help="priority of the loop, from 2")
+    parser.add_argument("--fifo", type=int, default=0, help="priority of the loop, from 1")
     parser.add_argument("--results", type=Path, help="folder of the picture; else none is drawn")
     options = parser.parse_args()
     torch.set_num_threads(1)
@@ -172,7 +169,7 @@ def main() -> None:
             with (local if processes == 1 else remote)(params) as connect, first(options.fifo):
                 for hz in rates:
                     name = f"{processes} process{'es' if processes > 1 else ''}, {hz:g} Hz"
-                    settings = RunSettings(INSTRUCTION, hz=hz, fifo_priority=options.fifo)
+                    settings = RunSettings(INSTRUCTION, hz=hz)
                     courses[name] = run(connect, settings, seconds)
                     tell(name, courses[name])
     finally:
@@ -260,21 +257,15 @@ def remote(params: Params) -> Generator[Callable[[], PolicySession]]:
         serving = next((line for line in server.stdout if line.startswith(SERVING)), None)
         if serving is None:
             raise RuntimeError(f"{' '.join(command)}: ended before it served")
-        client = leaving.enter_context(PolicyClient(serving.split()[1]))
-
-        def connect() -> PolicyClient:
-            client.reconnect()
-            return client
-
-        yield connect
+        yield lambda: leaving.enter_context(PolicyClient(serving.split()[1]))
 
 
 @contextmanager
 def first(priority: int) -> Generator[None]:
-    """All threads that begin within this go before other processes, as under `chrt -f 1`."""
+    """This thread, and those that begin within this, go before others, as under `chrt -f`."""
     before = os.sched_getscheduler(0), os.sched_getparam(0)
     if priority:
-        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
     try:
         yield
     finally:

@@ -12,7 +12,6 @@ policy's success alone, for `dvc metrics show`), episodes.csv (the policy's epis
   python -m stages.rollout --set rollout.environment=metaworld:assembly-v3   a task of Meta-World
   python -m stages.rollout --set rollout.chunking=none         another way to play chunks
   python -m stages.rollout --set 'rollout.latency_ms=[0, 300, 600]'   success against latency
-  python -m stages.rollout --set rollout.head=models/export    what stages.export wrote answers
   python -m stages.rollout --set rollout.server=ws://127.0.0.1:8000   what stages.serve answers
 """
 
@@ -76,13 +75,8 @@ def _here(params: "Params", say: Callable[[str], None]) -> "Rollouts":
     checkpoint = load_policy(find_policy(folder))
     device = resolve_device(wanted.device)
     load = partial(LiveFeatures, params.vlm, checkpoint.source["feature_spec"], str(device))
-    act, answers = None, ""
-    if wanted.head is not None:
-        from pipeline.robot.export import ExportedHead
-
-        act, answers = ExportedHead(wanted.head, checkpoint).act, f", {wanted.head} answers"
-    say(f"{folder} (step {checkpoint.step}), {_where(wanted)}, device {device}{answers}")
-    return roll_out(checkpoint, str(folder), checkpoint.policy(device), load, wanted, say, act)
+    say(f"{folder} (step {checkpoint.step}), {_where(wanted)}, device {device}")
+    return roll_out(checkpoint, str(folder), checkpoint.policy(device), load, wanted, say)
 
 
 def _served(wanted: "RolloutParams", say: Callable[[str], None]) -> "Rollouts":

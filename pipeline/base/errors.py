@@ -70,10 +70,6 @@ class ServerError(PipelineError, ConnectionError):
     """A policy server cannot be reached, refuses the connection, or is gone."""
 
 
-class ServerBusy(ServerError):
-    """A policy server has too many observations waiting; the connection stays."""
-
-
 class HubError(PipelineError, ConnectionError):
     """The Hugging Face Hub cannot be reached, or refuses a request."""
 

@@ -16,7 +16,6 @@ from typing import Any, ClassVar, Final, Generic, TypeVar
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
 from tqdm import tqdm
 
 from pipeline.base.commands import command
@@ -28,7 +27,6 @@ from pipeline.base.config import (
     latencies_ms,
 )
 from pipeline.base.errors import CheckpointMismatch, ConfigError
-from pipeline.base.observation import Observation
 from pipeline.evaluate.rollouts import (
     EXPERT,
     POLICY,
@@ -39,7 +37,6 @@ from pipeline.evaluate.rollouts import (
     late_name,
 )
 from pipeline.policy.checkpoint import PolicyCheckpoint
-from pipeline.policy.expert import Generators, Guide
 from pipeline.policy.observation import moving_channels, stream_of
 from pipeline.policy.policy import Policy
 from pipeline.robot.client import PolicyClient
@@ -47,15 +44,12 @@ from pipeline.robot.live_features import LiveFeatures, prove
 from pipeline.robot.loop import ControlLoop, Executor, SafeStop, check_chunking
 from pipeline.robot.readings import RobotMemory, SeenFeatures
 from pipeline.robot.session import stack_guides
-from pipeline.simulation.environment import InsertionEnvironment
-from pipeline.simulation.environments import environment_maker
+from pipeline.simulation.environment import InsertionEnvironment, environment_maker
 from pipeline.simulation.interface import Action, EnvironmentRobot, RobotEnvironment, Shots
 
 SIDE_BY_SIDE: Final = 50
 """Environments that are stepped together and share passes of a model in this process."""
 
-Act = Callable[[Observation, Generators, Guide | None], Tensor]
-"""Answers observations with chunks (robot, horizon, action), as `Policy.act` does."""
 Chunk = NDArray[np.float32]
 Readings = Mapping[str, NDArray[Any]]
 
@@ -67,17 +61,15 @@ def roll_out(
     load_features: Callable[[], LiveFeatures],
     wanted: RolloutParams,
     say: Callable[[str], None] = lambda line: None,
-    act: Act | None = None,
 ) -> Rollouts:
     """Run the policy, also with latencies and with streams ablated, and the demonstrator.
 
-    `act` answers in place of the policy's own `act`: it is that of an exported head. `say` prints a
-    line for each controller when its episodes have ended. If the policy uses features,
-    `load_features` is called after everything else was checked, and before the first episode the
-    model proves that it gives the policy's features (`prove`). Raises `CheckpointMismatch` where
-    an environment lacks what the policy was trained on, and `ConfigError` for an unknown
-    environment, for an instruction that the policy was not trained on, for chunking that its expert
-    cannot do and for more steps than a chunk has.
+    `say` prints a line for each controller when its episodes have ended. If the policy uses
+    features, `load_features` is called after everything else was checked, and before the first
+    episode the model proves that it gives the policy's features (`prove`). Raises
+    `CheckpointMismatch` where an environment lacks what the policy was trained on, and
+    `ConfigError` for an unknown environment, for an instruction that the policy was not trained on,
+    for chunking that its expert cannot do and for more steps than a chunk has.
     """
     shape, source = checkpoint.shape, checkpoint.source
     metadata = {key: source[key] for key in ("streams", "action_hz", "vlm_reuse_count")} | {
@@ -88,12 +80,12 @@ def roll_out(
         "instructions": checkpoint.instructions,
         "horizon": policy.params.horizon,
         "moving": moving_channels(source["streams"]["action"]),
-        "stochastic": policy.stochastic and act is None,
+        "stochastic": policy.stochastic,
         "uses_features": "features" in policy.encoders,
     }
     widths = {"action": shape.action_dim, "state": shape.state_dim, "sensor": shape.sensor_channels}
     drivers = [
-        _LocalDriver(metadata, widths, wanted, make, checkpoint, policy, act or policy.act)
+        _LocalDriver(metadata, widths, wanted, make, checkpoint, policy)
         for make in _environments(metadata, wanted)
     ]
     features = None
@@ -487,7 +479,6 @@ class _LocalDriver(_Driver[RobotMemory]):
     side_by_side = SIDE_BY_SIDE
     checkpoint: PolicyCheckpoint
     policy: Policy
-    act: Act
     features: LiveFeatures | None = None
     """The model; None if the policy needs none."""
 
@@ -537,7 +528,7 @@ class _LocalDriver(_Driver[RobotMemory]):
         observation = self.policy.observe(streams)
         guide = stack_guides(guides, observation.features.device)
         generators = [robot.generator for robot in robots]
-        return self.act(observation, generators, guide).cpu().numpy()
+        return self.policy.act(observation, generators, guide).cpu().numpy()
 
 
 @dataclass

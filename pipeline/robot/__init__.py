@@ -6,7 +6,7 @@ loop.py            what is due in which tick, how action chunks are played, and 
 realtime.py        the loop in real time: pacing, one tick, safe stops
 readings.py        a robot's readings and clock, and what a policy remembers of them
 limits.py          what a robot may do
-process.py         the policy's thread, the watchdog, priority and signals
+process.py         the policy's thread, the watchdog, and signals
 run_report.py      timings and missed ticks, and why a run ended
 recorder.py        a run becomes a recording
 lerobot_arm.py     a robot with LeRobot's interface
@@ -17,7 +17,6 @@ observation.py     a robot's observation, checked
 live_features.py   frames -> features by the policy's own model, checked with golden rows
 first_look.py      refuses exchanged views, colours, units and channels
 session.py         a served policy, and its memory of each robot
-server.py          the websocket server
-server_status.py   its counts, latencies and log
+server.py          the websocket server, its status and its log
 export.py          the head as ONNX and torch.export
 """

@@ -10,7 +10,7 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus, WebSocketExce
 from websockets.sync.client import ClientConnection, connect
 
 from pipeline.base.differences import describe, differences
-from pipeline.base.errors import CheckpointMismatch, ObservationError, ServerBusy, ServerError
+from pipeline.base.errors import CheckpointMismatch, ObservationError, ServerError
 from pipeline.robot import wire
 
 TOKEN_VARIABLE: Final = "VLA_SERVE_TOKEN"
@@ -44,19 +44,12 @@ class PolicyClient(AbstractContextManager["PolicyClient"]):
         self._url = url if "://" in url else f"ws://{url}"
         if not self._url.startswith(("ws://", "wss://")):
             raise ServerError(f"{url}: expected an address such as ws://127.0.0.1:8000")
-        self._token, self._robot, self._timeout_s = token, robot or {}, timeout_s
-        self._reset: bool | int | None = None
-        self._connection: ClientConnection | None = None
+        self._timeout_s, self._reset = timeout_s, dict[str, bool | int]()
         self._leaving = ExitStack()
-        self.reconnect()
-
-    def reconnect(self) -> None:
-        """Connect again and begin a new episode: the server has lost its memory of the last one."""
-        self.close()
-        self._connection = self._connected()
+        self._connection = self._connected(token)
         try:
             self.metadata = wire.unpack(self._receive())
-            refuse_other_robot(self._robot, self.metadata)
+            refuse_other_robot(robot or {}, self.metadata)
         except Exception:
             self.close()
             raise
@@ -64,36 +57,28 @@ class PolicyClient(AbstractContextManager["PolicyClient"]):
     def infer(self, observation: Mapping[str, Any]) -> dict[str, Any]:
         """The answer to an observation, with `actions` (horizon, action).
 
-        Raises `ObservationError` where the server refuses the observation, `ServerBusy` where too
-        many wait (the connection stays, and the server has taken the readings), `ServerError` where
-        the connection is lost or the answer is late: then `reconnect`.
+        Raises `ObservationError` where the server refuses the observation, `ServerError` where the
+        connection is lost or the answer is late. After either it is closed: make another client.
         """
-        reset = {} if self._reset is None else {"reset": self._reset}
-        message = wire.pack({**observation, **reset})
-        try:
-            answer = wire.unpack(self._receive(message))
-        except ServerBusy:
-            self._reset = None  # The server has taken the reset with the readings.
-            raise
-        self._reset = None
+        reset, self._reset = self._reset, {}
+        answer = wire.unpack(self._receive(wire.pack({**observation, **reset})))
         if "feature_key" in answer:
             answer["feature_key"] = np.frombuffer(answer["feature_key"], np.uint8)
         return answer
 
     def reset(self, seed: int | None = None) -> None:
         """Begin a new episode with the next observation; `seed` seeds the policy's samples."""
-        self._reset = True if seed is None else seed
+        self._reset = {"reset": True if seed is None else seed}
 
     def close(self) -> None:
         """Leave the server."""
-        self._connection = None
         self._leaving.close()
 
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _connected(self) -> ClientConnection:
-        headers = {"Authorization": f"Api-Key {self._token}"} if self._token else None
+    def _connected(self, token: str | None) -> ClientConnection:
+        headers = {"Authorization": f"Api-Key {token}"} if token else None
         try:
             connecting = connect(
                 self._url,
@@ -115,8 +100,6 @@ class PolicyClient(AbstractContextManager["PolicyClient"]):
 
     def _receive(self, message: bytes | None = None) -> bytes:
         """The server's next message, after sending this one; a text is an error."""
-        if self._connection is None:
-            raise ServerError(f"{self._url}: not connected; call reconnect")
         try:
             if message is not None:
                 self._connection.send(message)
@@ -125,7 +108,8 @@ class PolicyClient(AbstractContextManager["PolicyClient"]):
             self.close()  # A late answer would be mistaken for the next one.
             raise ServerError(
                 f"{self._url}: expected an answer within {self._timeout_s:g} s, found none, and "
-                "left. Stop the robot; then reconnect, with a longer timeout_s if the model is slow"
+                "left. Stop the robot; then connect again, with a longer timeout_s if the model is "
+                "slow"
             ) from None
         except ConnectionClosed as error:
             self.close()
@@ -133,13 +117,11 @@ class PolicyClient(AbstractContextManager["PolicyClient"]):
             if error.rcvd and error.rcvd.code == CloseCode.MESSAGE_TOO_BIG:
                 why = f"{why}: send smaller images, or raise serve.max_message_mb"
             raise ServerError(
-                f"{self._url}: the connection is lost ({why}), and with it what the server "
-                "remembered. Stop the robot; then reconnect, which begins a new episode"
+                f"{self._url}: the connection is closed ({why}), and what the server remembered of "
+                "this robot is gone. Stop the robot; then connect again and begin a new episode"
             ) from None
         if isinstance(answer, bytes):
             return answer
-        if answer.startswith("busy: "):
-            raise ServerBusy(answer)
         self.close()
         if answer.startswith("refused: "):
             raise ObservationError(answer.removeprefix("refused: "))

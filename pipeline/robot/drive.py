@@ -185,10 +185,11 @@ class _Shown:
 
 def _tell(report: RunReport, say: Callable[[str], None]) -> None:
     """Print how the run went; raise `RobotStopped` after a safe stop."""
-    for line in report.tick_timings.table().text():
-        say(line)
+    for timings in (report.tick_timings, report.answer_timings):
+        for line in timings.table().text():
+            say(line)
     counts = f"{report.ticks} ticks, {report.missed_ticks} late, {report.answers} answers"
-    say(f"{counts}, {report.clipped} actions clipped, {report.old_features} of old features")
+    say(f"{counts}, {report.clipped} actions clipped")
     if report.recording is not None:
         say(f"recording: {report.recording} (python -m stages.inspect {report.recording})")
     if report.traceback:

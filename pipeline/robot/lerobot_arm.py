@@ -23,8 +23,6 @@ from pipeline.base.errors import CheckpointMismatch
 _DELTA, _PLACE = "delta_", ".pos"
 _PORT_S = 0.2
 """How long a stop waits for another call that holds the robot's port."""
-_ROWS = 8
-"""To see whether an image has changed, one of so many rows is compared: noise changes each row."""
 
 
 class LeRobotArm:
@@ -56,7 +54,6 @@ class LeRobotArm:
         self._robot, self._clock_s, self._say = robot, clock_s, say
         self._camera_latency_s = camera_latency_s
         self._port = threading.Lock()
-        self._shown: dict[str, tuple[float, NDArray[np.uint8]]] = {}
         streams, seen, moved = (
             metadata["streams"],
             robot.observation_features,
@@ -95,20 +92,9 @@ class LeRobotArm:
         return observed
 
     def frames(self) -> dict[str, tuple[float, NDArray[np.uint8]]]:
-        """The frames of the newest observation by view: capture time in s, and RGB image.
-
-        An image that has not changed keeps its time, so the frame of a stuck camera ages.
-        """
+        """The frames of the newest observation by view: capture time in s, and RGB image."""
         taken_s = self._time_s - self._camera_latency_s
-        frames: dict[str, tuple[float, NDArray[np.uint8]]] = {}
-        for view, key in self._views.items():
-            image = np.asarray(self._seen[key])
-            shown_s, rows = self._shown.get(view, (taken_s, None))
-            if rows is None or not np.array_equal(image[::_ROWS], rows):
-                shown_s = taken_s
-                self._shown[view] = taken_s, image[::_ROWS].copy()
-            frames[view] = shown_s, image
-        return frames
+        return {view: (taken_s, np.asarray(self._seen[key])) for view, key in self._views.items()}
 
     def act(self, action: NDArray[np.floating[Any]]) -> None:
         """Send an action (action_dim,); a delta is added to the motor's last goal.

@@ -181,10 +181,6 @@ class Executor:
         rest[: len(left)] = left
         return PlanGuide(rest, soft_mask(self.horizon, max(self._delays), overlap))
 
-    def refused(self) -> None:
-        """Note that no chunk comes for the observation that `begin` marked."""
-        self._begun = None
-
     def plan(self, chunk: ArrayLike) -> None:
         """Take the chunk of the observation that `begin` marked, (horizon, action)."""
         steps = np.array(chunk, np.float32)
@@ -234,8 +230,7 @@ class ControlLoop:
     def reset(self) -> None:
         """Begin the next episode."""
         self.executor.reset()
-        self._tick, self._pass_began, self._asked = -1, -self._reuse, -1
-        self._under_way = False
+        self._tick, self._pass_began, self._under_way = -1, -self._reuse, False
 
     def begin_tick(self) -> None:
         """Begin a tick."""
@@ -257,19 +252,12 @@ class ControlLoop:
 
     @property
     def chunk_due(self) -> bool:
-        """Whether to ask for the next chunk; never between `ask` and `plan` or `refused`."""
+        """Whether to ask for the next chunk; never between `ask` and `plan`."""
         return self.executor.due
 
     def ask(self) -> PlanGuide | None:
         """Note that the next chunk is requested now; returns the plan that it should continue."""
-        self._asked = self._tick
         return self.executor.begin()
-
-    def refused(self) -> None:
-        """Note that the last question is not answered and its frames were not used."""
-        self.executor.refused()
-        if self._pass_began == self._asked:
-            self._pass_began, self._under_way = self._asked - self._reuse, False
 
     def plan(self, chunk: NDArray[np.float32]) -> None:
         """Take the answered chunk (horizon, action), in physical units.

@@ -1,7 +1,6 @@
-"""The process of a robot's loop: two threads beside the loop, its priority and its signals."""
+"""The process of a robot's loop: two threads beside the loop, and its signals."""
 
 import gc
-import os
 import signal
 import sys
 import threading
@@ -12,12 +11,11 @@ from contextlib import contextmanager
 from queue import Empty, SimpleQueue
 from typing import Any
 
-from pipeline.base.errors import ConfigError, ServerBusy
 from pipeline.robot.loop import SafeStop, StopKind
 
 Answer = Mapping[str, Any]
 
-_SIGNALS = ("SIGINT", "SIGTERM", "SIGHUP")
+_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _SWITCH_S = 5e-4
 """How long another thread of this process may hold Python while the loop waits for it."""
 
@@ -25,8 +23,8 @@ _SWITCH_S = 5e-4
 class PolicyThread:
     """Asks the policy on a thread of its own, one question at a time."""
 
-    def __init__(self, infer: Callable[[Mapping[str, Any]], Answer], fifo_priority: int) -> None:
-        self._infer, self._priority = infer, fifo_priority
+    def __init__(self, infer: Callable[[Mapping[str, Any]], Answer]) -> None:
+        self._infer = infer
         self._questions: SimpleQueue[Mapping[str, Any] | None] = SimpleQueue()
         self._answers: SimpleQueue[tuple[float, Answer | Exception]] = SimpleQueue()
         self.busy = self._stale = False
@@ -47,23 +45,18 @@ class PolicyThread:
     def take(self) -> Answer | None:
         """The answer if it has come, else None.
 
-        Raises `SafeStop` if the policy failed, and `ServerBusy` if the server does not answer this
-        question.
+        Raises `SafeStop` if the policy failed.
         """
         try:
             self.took_s, answer = self._answers.get_nowait()
         except Empty:
             return None
         stale, self.busy, self._stale = self._stale, False, False
-        if isinstance(answer, Exception) and not isinstance(answer, ServerBusy):
+        if isinstance(answer, Exception):
             lost = isinstance(answer, ConnectionError)
             kind = StopKind.CONNECTION if lost else StopKind.POLICY
             raise SafeStop(kind, f"{kind.value}: {type(answer).__name__}: {answer}") from answer
-        if stale:
-            return None
-        if isinstance(answer, ServerBusy):
-            raise answer
-        return answer
+        return None if stale else answer
 
     def close(self) -> None:
         """Ask no more; wait for an awaited answer, but at most 5 s."""
@@ -71,8 +64,6 @@ class PolicyThread:
         self._thread.join(timeout=5.0)
 
     def _serve(self) -> None:
-        if self._priority > 0:
-            _go_first(self._priority)
         while (question := self._questions.get()) is not None:
             self._answer(question)
 
@@ -139,24 +130,12 @@ def stop_firmly(stop: Callable[[str], object], reason: str) -> str:
 
 
 @contextmanager
-def undisturbed(fifo_priority: int) -> Generator[None]:
-    """Run this thread before others and without garbage collection, which the loop does not need.
+def undisturbed() -> Generator[None]:
+    """Run this thread without garbage collection, which the loop does not need.
 
-    Raises `ConfigError` if the machine does not grant the priority; 0 requests none.
+    Other threads hold Python for half a millisecond at most.
     """
     switch_s, collects = sys.getswitchinterval(), gc.isenabled()
-    if fifo_priority not in (0, *range(2, 100)):
-        raise ConfigError(f"fifo_priority: expected 0, or 2 to 99, found {fifo_priority}")
-    scheduled: tuple[Any, ...] = ()
-    if fifo_priority:
-        try:
-            scheduled = os.sched_getscheduler(0), os.sched_getparam(0)
-            _go_first(fifo_priority)
-        except (OSError, AttributeError) as error:
-            raise ConfigError(
-                f"fifo_priority: this machine does not grant priority {fifo_priority} ({error}). "
-                "Allow it (rtprio in /etc/security/limits.conf), or set it to 0."
-            ) from None
     gc.collect()
     gc.freeze()
     gc.disable()
@@ -168,8 +147,6 @@ def undisturbed(fifo_priority: int) -> Generator[None]:
         gc.unfreeze()
         if collects:
             gc.enable()
-        if fifo_priority:
-            os.sched_setscheduler(0, *scheduled)
 
 
 @contextmanager
@@ -189,18 +166,13 @@ def ended_by_hand() -> Generator[list[str]]:
 
     here = threading.current_thread() is threading.main_thread()
     try:
-        for name in _SIGNALS if here else ():
-            handler = signal.getsignal(number := getattr(signal, name, signal.SIGINT))
+        for number in _SIGNALS if here else ():
+            handler = signal.getsignal(number)
             # A signal that the process ignores, as under nohup, stays ignored.
-            if handler not in (signal.SIG_IGN, None) and number not in before:
+            if handler not in (signal.SIG_IGN, None):
                 before[number] = handler
                 signal.signal(number, end)
         yield ended
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
-
-
-def _go_first(fifo_priority: int) -> None:
-    """Schedule this thread, and those that it starts, before all of a lower priority."""
-    os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(fifo_priority))

@@ -28,7 +28,7 @@ class PendingReadings:
     """The readings of a stream since the last question, but only the newest `most` of them."""
 
     def __init__(self, most: int, channels: int) -> None:
-        self.channels, self.dropped = channels, 0
+        self.channels = channels
         self._pending: deque[tuple[NDArray[np.float32], float]] = deque(maxlen=most)
         self.newest_s: float | None = None
         """Time of the newest reading of the episode; None before the first."""
@@ -58,9 +58,7 @@ class PendingReadings:
             ahead = time_s[-1] - latest_s
             raise SafeStop(StopKind.CLOCK, f"{name}: a reading is of the future, by {ahead:.3f} s")
         self.newest_s = float(time_s[-1])
-        total = len(self._pending) + len(time_s)
         self._pending.extend(zip(np.array(values, np.float32), map(float, time_s), strict=True))
-        self.dropped += total - len(self._pending)
 
     def hand_over(self) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
         """Return the pending readings and their times, and remove them from here."""
@@ -77,11 +75,9 @@ class RobotClock:
     more drift.
     """
 
-    def __init__(self, offset_s: float | None, drift_s: float) -> None:
-        """`offset_s` is the robot's clock minus ours; with None it is measured."""
-        self._declared, self._drift_s = offset_s, drift_s
-        self.offset_s = -math.inf if offset_s is None else offset_s
-        self._seen = 0
+    def __init__(self, drift_s: float) -> None:
+        self._drift_s, self._seen = drift_s, 0
+        self.offset_s = -math.inf
 
     def now_s(self) -> float:
         """The time on the robot's clock, if it has kept its offset."""
@@ -91,7 +87,7 @@ class RobotClock:
         """Check a time that the robot just gave; raises `SafeStop` if the offset has moved."""
         offset = time_s - time.monotonic()
         self._seen += 1
-        if self._declared is None and self._seen <= _FIRST_OBSERVATIONS:
+        if self._seen <= _FIRST_OBSERVATIONS:
             # The observation that took the least time to arrive gives the truest offset.
             self.offset_s = max(self.offset_s, offset)
         moved = offset - self.offset_s
@@ -136,11 +132,6 @@ class SeenFeatures:
     """(view,) in s, NaN for a missing view."""
     key: bytes = b""
     """`row_key` of the frames and prompt; empty unless a session computed the features."""
-
-
-def older_than_trained(age_s: float, trained_age_s: float) -> bool:
-    """Whether features are older than any in training, by over 10 %: clocks are not exact."""
-    return age_s > 1.1 * trained_age_s
 
 
 class RobotMemory:

@@ -26,18 +26,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.base.config import Chunking
-from pipeline.base.errors import ConfigError, ServerBusy
+from pipeline.base.errors import ConfigError
 from pipeline.robot.limits import Limits
 from pipeline.robot.loop import ControlLoop, Executor, SafeStop, StopKind
 from pipeline.robot.process import PolicyThread, Watchdog, ended_by_hand, stop_firmly, undisturbed
-from pipeline.robot.readings import PendingReadings, RobotClock, older_than_trained
+from pipeline.robot.readings import PendingReadings, RobotClock
 from pipeline.robot.run_report import (
     ANSWER_PARTS,
-    MissedTick,
     RunReport,
     TickPart,
     TickTimer,
-    allowed_ms,
 )
 
 if TYPE_CHECKING:  # It writes images and parquet, which the loop does not need.
@@ -97,9 +95,6 @@ class RunSettings:
     """How long; None: until something ends it."""
     seed: int | None = None
     """Seeds the samples that the policy draws."""
-    clock_offset_s: float | None = None
-    """The robot's clock less `time.monotonic()`; None: the quickest of the first observations gives
-    it."""
     clock_drift_s: float = 0.1
     """How far the robot's clock may leave its offset, and a reading lie in the future."""
     first_answer_s: float = 60.0
@@ -116,11 +111,6 @@ class RunSettings:
     """Ticks left out, with none in time between them, at which the robot stops."""
     hung_s: float = 0.5
     """How long a tick may take, at least two and a half ticks, before the watchdog stops it."""
-    fifo_priority: int = 0
-    """2 to 99: the loop's thread goes before whatever has less (SCHED_FIFO of Linux), and the
-    policy's thread has one less; needs the right to (`ulimit -r`, or root). 0 leaves both as they
-    are. Start the whole process under `chrt -f 1`: a thread that holds Python while another process
-    has its core keeps the loop waiting."""
 
 
 def run_robot(
@@ -137,10 +127,10 @@ def run_robot(
     ends the run. Nobody stops the robot where the process is killed (SIGKILL, no memory, no power):
     its own controller must, when no action comes.
 
-    Raises `ConfigError` before the first observation where settings do not fit the policy, the
-    limits or the machine.
+    Raises `ConfigError` before the first observation where settings do not fit the policy or the
+    limits.
     """
-    with undisturbed(settings.fifo_priority), ended_by_hand() as signals:
+    with undisturbed(), ended_by_hand() as signals:
         run = _Run(robot, policy, settings, limits, recorder)
         report = run.report
         try:
@@ -185,7 +175,6 @@ class _Run:
                 f"limits: expected hz={self.hz:g}, the actions that the loop sends a second, found "
                 f"{limits.hz:g}. Make the limits with hz={self.hz:g}."
             )
-        self.trained_age_s = float(meta.get("trained_age_s", math.inf))
         self.chunk_shape = (meta["horizon"], meta["action_dim"])
         self.views = tuple(meta["streams"]["views"]) if meta["uses_features"] else ()
         moving = tuple(meta["moving"])
@@ -194,7 +183,7 @@ class _Run:
         )
         reuse = max(1, round(meta["vlm_reuse_count"] * self.hz / meta["action_hz"]))
         self.loop = ControlLoop(executor, reuse, meta["uses_features"])
-        self.policy = PolicyThread(policy.infer, settings.fifo_priority - 1)
+        self.policy = PolicyThread(policy.infer)
         self.looks_at = set(meta["looks_at"]) - {"features"}
         self.pending = {
             name: PendingReadings(
@@ -203,8 +192,8 @@ class _Run:
             for name in sorted(self.looks_at | (limits.streams if limits else set()))
         }
         self.watched = tuple(self.pending) if settings.watch is None else settings.watch
-        self.clock = RobotClock(settings.clock_offset_s, settings.clock_drift_s)
-        self.report = RunReport(meta["action_dim"])
+        self.clock = RobotClock(settings.clock_drift_s)
+        self.report = RunReport()
         self.timer, self.missed_in_a_row = TickTimer(), 0
         self.unrecorded: tuple[Mapping[str, Any], NDArray[np.float64] | None] | None = None
         self.begin_episode()
@@ -219,19 +208,19 @@ class _Run:
             self.timer.begin(deadline)
             if self.settings.seconds is not None and tick >= self.settings.seconds * self.hz:
                 raise SafeStop(StopKind.TIME, f"{self.settings.seconds:g} s are over")
-            self.tick(tick)
+            self.tick()
             ended = self.timer.end()
             self.report.tick_timings.note(self.timer.row_ms())
             self.report.ticks += 1
             following = tick + 1
             if ended > deadline + period:
                 following = max(following, math.ceil((ended - start) * self.hz))
-                self.miss(tick, ended - deadline - period, following - tick - 1)
+                self.miss(following - tick - 1)
             else:
                 self.missed_in_a_row = 0
             tick = following
 
-    def tick(self, tick: int) -> None:
+    def tick(self) -> None:
         """Observe, check, take an answer, ask, act, record."""
         self.timer.mark("observe")
         observed = self.robot.observe()
@@ -247,7 +236,7 @@ class _Run:
         if self.loop.chunk_due and not self.policy.busy:
             self.ask()
         self.timer.mark("plan")
-        self.act(tick, observed)
+        self.act(observed)
         self.record()
         self.watchdog.beat()
         self.watchdog.check()
@@ -294,13 +283,7 @@ class _Run:
 
     def take_answer(self) -> None:
         """Plan the chunk of an answer, where one has come."""
-        try:
-            answer = self.policy.take()
-        except ServerBusy:
-            answer = None
-            self.report.busy += 1
-            self.loop.refused()
-        if answer is None:
+        if (answer := self.policy.take()) is None:
             first_s, waited_s = self.settings.first_answer_s, time.monotonic() - self.begun_s
             if not self.loop.executor.planned and waited_s > first_s:
                 raise SafeStop(StopKind.NO_CHUNK, f"no first chunk within {first_s:g} s")
@@ -313,9 +296,7 @@ class _Run:
             self.recorder.answer(answer)
             self.timer.mark("plan")
         if answer.get("feature_age_s") is not None:
-            age_s = float(answer["feature_age_s"])
-            self.features_s = self.asked_s - age_s
-            self.report.old_features += older_than_trained(age_s, self.trained_age_s)
+            self.features_s = self.asked_s - float(answer["feature_age_s"])
             if self.features_s >= self.frames_s - 1e-3:
                 self.loop.pass_ended()
         chunk = np.asarray(answer["actions"], np.float32)
@@ -364,23 +345,9 @@ class _Run:
         self.frames_s = max(frames[view][0] for view in self.views)
         return fields
 
-    def _answer_times(self) -> str:
-        """How long answers took, beside how long they may take."""
-        took = self.report.answer_timings.document().get(ANSWER_PARTS[0])
-        if took is None:
-            return ""
-        half_ms = allowed_ms(self.loop.executor.horizon, self.hz)
-        return (
-            f": answers took {took['p50']:.0f} ms (median), {took['max']:.0f} ms at most; half of "
-            f"a chunk is {half_ms:.0f} ms"
-        )
-
-    def act(self, tick: int, observed: Mapping[str, Any]) -> None:
+    def act(self, observed: Mapping[str, Any]) -> None:
         """Send this tick's action within the limits; nothing before the first chunk."""
-        try:
-            action = self.loop.action()
-        except SafeStop as stop:
-            raise SafeStop(stop.kind, f"{stop}{self._answer_times()}") from None
+        action = self.loop.action()
         if action is not None:
             age_s = self.now_s - self.features_s if self.views else 0.0
             if not age_s <= self.settings.old_features_s:
@@ -395,7 +362,6 @@ class _Run:
             self.timer.mark("act")
             self.unrecorded = observed, action
             self.robot.act(action)
-            self.report.sent.note((tick, self.now_s, *action))
 
     def record(self) -> None:
         """Give the recorder this tick, once: at its end, or where it has stopped the robot."""
@@ -404,11 +370,10 @@ class _Run:
             self.timer.mark("record")
             self.recorder.tick(*unrecorded)
 
-    def miss(self, tick: int, late_s: float, left_out: int) -> None:
+    def miss(self, left_out: int) -> None:
         """Count a late tick; stop where too many are left out while the robot moves."""
         seconds = self.timer.seconds
         part = max(seconds, key=seconds.__getitem__)
-        self.report.missed.append(MissedTick(tick, 1000 * late_s, part, left_out))
         self.report.missed_ticks += 1
         self.report.left_out += left_out
         self.missed_in_a_row += left_out
@@ -437,7 +402,5 @@ class _Run:
             failed = f"the last tick is not recorded: {traceback.format_exc()}"
         self.watchdog.close()
         self.policy.close()
-        self.report.dropped_readings = sum(self.pending[name].dropped for name in self.looks_at)
         self.report.clipped = self.limits.clipped if self.limits else 0
-        self.report.clock_offset_s = self.clock.offset_s
         return self.watchdog.failed + failed

@@ -73,8 +73,8 @@ def log_types(metadata: Mapping[str, Any]) -> "dict[str, np.dtype[Any]]":
     """The row type of each log by name, for a policy with this metadata.
 
     `tick` has its `time` (s, the robot's clock), whether an action was sent (`acted`), the state
-    readings so far (`states`), the number of the newest `frame` of each view (-1: none), and the
-    newest answer's number (`answer`, 0: none), `key` and `age_s`.
+    readings so far (`states`), the number of the newest `frame` of each view (-1: none), and `key`
+    and `age_s` of the newest answer's features.
     """
     streams = metadata["streams"]
     widths = {name: len(streams.get(name, {}).get("names", ())) for name in READINGS}
@@ -85,8 +85,7 @@ def log_types(metadata: Mapping[str, Any]) -> "dict[str, np.dtype[Any]]":
     }
     action, views = len(streams["action"]["names"]), len(streams["views"])
     rows["tick"] = [("time", "f8"), ("acted", "?"), ("action", "f4", (action,)), ("states", "i8")]
-    rows["tick"] += [("frame", "i4", (views,)), ("answer", "i8"), ("key", "u1", (16,))]
-    rows["tick"] += [("age_s", "f4")]
+    rows["tick"] += [("frame", "i4", (views,)), ("key", "u1", (16,)), ("age_s", "f4")]
     rows["frame"] = [("time", "f8"), ("shape", "i4", (3,))]
     return {name: np.dtype(fields) for name, fields in rows.items()}
 
@@ -152,7 +151,6 @@ class RunRecorder:
     def answer(self, answer: Mapping[str, Any]) -> None:
         """Record the features behind the next actions: `feature_key`, `feature_age_s`."""
         with self._unharmed():
-            self._tick["answer"] += 1
             self._tick["key"] = np.asarray(answer.get("feature_key", 0), np.uint8)
             self._tick["age_s"] = answer.get("feature_age_s", np.nan)
 
@@ -278,10 +276,10 @@ def finish_recording(part: Path, end: Mapping[str, Any]) -> Path:
         )
     root = part / ".recording"  # folders that begin with a dot are not searched for recordings
     begin_folder(root, _RUN)
-    left_out = _write_readings(root, run, logs, float(rows["time"][0]))
-    counts = {"ticks": len(logs["tick"]), "rows": len(rows), "readings_left_out": left_out}
-    began = run.model_dump(exclude_unset=True)
-    write_document(root / RUN, {**began, **end, **counts, "start_s": float(rows["time"][0])})
+    start_s = float(rows["time"][0])
+    _write_readings(root, run, logs, start_s)
+    counts = {"ticks": len(logs["tick"]), "rows": len(rows), "start_s": start_s}
+    write_document(root / RUN, {**run.model_dump(exclude_unset=True), **end, **counts})
     _write_rows(root, part, run, logs, rows)
     unmark(root)
     for file in root.rglob("*"):
@@ -345,11 +343,8 @@ def _rows(logs: Mapping[str, Log]) -> Log:
     return ticks[begun[:, begun.any(axis=0)].all(axis=1)]
 
 
-def _write_readings(
-    root: Path, run: RunDocument, logs: Mapping[str, Log], start_s: float
-) -> dict[str, int]:
-    """Write the sidecars of readings; returns how many NaN or disordered ones each leaves out."""
-    left_out: dict[str, int] = {}
+def _write_readings(root: Path, run: RunDocument, logs: Mapping[str, Log], start_s: float) -> None:
+    """Write the sidecars of readings, without those that stopped the robot: NaN or disordered."""
     for name in READINGS:
         if len(log := logs[name]):
             times = log["time"]
@@ -357,13 +352,11 @@ def _write_readings(
             bad = np.flatnonzero(
                 non_finite(log["values"]).any(axis=1) | ~np.isfinite(times) | backwards
             )
-            left_out[name] = len(bad)
             kept = np.delete(log, bad) if len(bad) else log
             channels = run.metadata["streams"][name]
             named = {key: np.array(channels[key], str) for key in ("names", "units")}
             readings = {"timestamps": kept["time"] - start_s, "values": kept["values"]}
             write_sidecar(root, name, readings | named)
-    return left_out
 
 
 def _write_rows(
@@ -392,7 +385,7 @@ def _write_rows(
     if captured:
         write_sidecar(root, "frames", captured)
     digest = np.array([str(metadata.get("feature_spec_digest", ""))])
-    used = {name: rows[name] for name in ("answer", "key", "age_s")}
+    used = {"key": rows["key"], "age_s": rows["age_s"]}
     write_sidecar(root, "features", used | {"feature_spec_digest": digest})
     episode = LeRobotEpisode(columns, images=images)
     write_data_set(root, [episode], features, run.instruction, metadata["action_hz"])

@@ -2,9 +2,7 @@
 
 import math
 import time
-from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, get_args
 
@@ -24,16 +22,15 @@ KEPT = 65536
 PERCENTILES = {"p50": 50.0, "p99": 99.0, "p99.9": 99.9}
 
 
-def allowed_ms(horizon: int, hz: float) -> float:
-    """How long an answer may take: half of a chunk of `horizon` steps at `hz`."""
-    return 500 * horizon / hz
+class Timings:
+    """Milliseconds of parts, a row for each tick or answer; NaN if a part did not happen.
 
+    The newest `rows` rows stay, in a buffer that is never reallocated.
+    """
 
-class Ring:
-    """The newest `rows` rows (row, column) of float64, in a buffer that is never reallocated."""
-
-    def __init__(self, rows: int, columns: int) -> None:
-        self._buffer = np.full((rows, columns), np.nan)
+    def __init__(self, parts: Sequence[str], rows: int) -> None:
+        self.parts = tuple(parts)
+        self._buffer = np.full((rows, len(self.parts)), np.nan)
         self.count = 0
         """The number of rows ever added."""
 
@@ -43,17 +40,9 @@ class Ring:
         self.count += 1
 
     def rows(self) -> NDArray[np.float64]:
-        """A copy of the rows, oldest first."""
+        """A copy of the kept rows, oldest first."""
         free = max(0, len(self._buffer) - self.count)
         return np.roll(self._buffer, -self.count, axis=0)[free:]
-
-
-class Timings(Ring):
-    """Milliseconds of parts, a row for each tick or answer; NaN if a part did not happen."""
-
-    def __init__(self, parts: Sequence[str], rows: int) -> None:
-        self.parts = tuple(parts)
-        super().__init__(rows, len(self.parts))
 
     def document(self) -> dict[str, dict[str, float]]:
         """For each part, over the kept rows: its count, and percentiles and maximum in ms."""
@@ -98,41 +87,17 @@ class TickTimer:
         return [*(1000 * self.seconds.get(part, math.nan) for part in TICK_PARTS), 1000 * tick]
 
 
-@dataclass(frozen=True)
-class MissedTick:
-    """A tick that ended after the deadline of the next one."""
-
-    tick: int
-    late_ms: float
-    """After that deadline."""
-    part: str
-    """The part that took the most time."""
-    left_out: int
-    """Ticks after it that were not run."""
-
-
 class RunReport:
-    """How a run went and why it ended; timings and actions are of the newest `KEPT` ticks."""
+    """How a run went and why it ended; timings are of the newest `KEPT` ticks."""
 
-    def __init__(self, action_dim: int) -> None:
+    def __init__(self) -> None:
         self.kind, self.reason = StopKind.LOOP, "the process ends"
         self.tick_timings = Timings((*TICK_PARTS, "tick"), KEPT)
         self.answer_timings = Timings(ANSWER_PARTS, KEPT)
-        self.missed = deque[MissedTick](maxlen=KEPT)
-        self.sent = Ring(KEPT, 2 + action_dim)
-        """For each tick with an action: its number, the robot's time, and the action."""
         self.ticks = self.left_out = self.missed_ticks = 0
         """Ticks that were run, ticks skipped because one before took too long, and late ticks."""
-        self.busy = 0
-        """Questions that the policy's server was too busy to answer; it took their readings."""
-        self.dropped_readings = 0
-        """Readings that came between two questions and are older than a policy's window holds."""
-        self.old_features = 0
-        """Answers from features that were older than the policy was trained for."""
         self.clipped = 0
         """Ticks in which limits clipped the action."""
-        self.clock_offset_s = math.nan
-        """The robot's clock minus `time.monotonic()`."""
         self.recording: Path | None = None
         self.traceback = ""
         """Tracebacks of all errors, also in stopping and in recording; empty if all went well."""
@@ -141,11 +106,6 @@ class RunReport:
     def answers(self) -> int:
         """Answers of the policy."""
         return self.answer_timings.count
-
-    @property
-    def actions(self) -> NDArray[np.float64]:
-        """(tick, 2 + action): the tick's number, the robot's time, and the action that was sent."""
-        return self.sent.rows()
 
     def timings(self) -> dict[str, Any]:
         """The timings as a recording keeps them."""

@@ -2,47 +2,112 @@
 
 A connection is one robot: it gets the metadata, then an answer to each observation, in order. A
 wrong message closes its own connection only, after one line of text that says why: `refused: …` or
-`error: …`. After `busy: …` the connection stays open.
+`error: …`.
 """
 
 import asyncio
 import hmac
 import ipaddress
+import json
 import logging
+import math
 import os
 import signal
 import socket
 import sys
 import threading
 import traceback
-from collections.abc import Callable
+from collections import Counter, deque
+from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, suppress
+from datetime import UTC, datetime
 from http import HTTPStatus
 from time import monotonic
-from typing import Final, cast
-from urllib.parse import urlsplit
+from typing import Any, Final, Literal, cast
 
 from websockets.asyncio.server import Server, ServerConnection, serve
-from websockets.datastructures import Headers, MultipleValuesError
 from websockets.exceptions import ConnectionClosed
 from websockets.frames import CloseCode
 from websockets.http11 import Request, Response
 
-from pipeline.base.border import shown
 from pipeline.base.config import ServeParams
 from pipeline.base.errors import ConfigError, ObservationError, PipelineError, WireError
 from pipeline.robot import wire
 from pipeline.robot.client import TOKEN_VARIABLE
-from pipeline.robot.observation import KEY_MAPS
-from pipeline.robot.run_report import allowed_ms
-from pipeline.robot.server_status import Event, ServerStatus
+from pipeline.robot.run_report import Timings
 from pipeline.robot.session import ServedPolicy, Session
 
 CLOSING_S: Final = 30.0
 """How long an unanswered observation may keep the server from closing."""
 _TURNED_AWAY: Final = (401, 403, 503)
 """Statuses of requests that are noted as turned away."""
+Event = Literal["connected", "left", "episode", "warning", "refused", "error", "turned away"]
+_REFUSALS: Final = ("refused", "error", "turned away")
+_TIMED: Final = ("vlm_ms", "head_ms", "wait_ms", "infer_ms")
+_TIMINGS: Final = 5000
+"""Newest answers whose latencies are kept."""
+_SHOWN: Final = 20
+"""Newest refusals and warnings that `/status.json` lists."""
+
+
+class ServerStatus:
+    """Counts, latencies and events of a server. Any thread may call it."""
+
+    def __init__(self, metadata: Mapping[str, Any], say: Callable[[str], None]) -> None:
+        """`say` writes the line of an event."""
+        self._counts: Counter[Event] = Counter()
+        shown = ("checkpoint", "step", "model_type", "action_hz", "feature_spec_digest")
+        self._policy = {name: metadata[name] for name in shown}
+        self._timings, self._since_s = Timings(_TIMED, _TIMINGS), monotonic()
+        self._lock, self._say = threading.Lock(), say
+        self._refusals, self._warnings = (deque[dict[str, str]](maxlen=_SHOWN) for _ in range(2))
+
+    @property
+    def connected(self) -> int:
+        """The robots that are connected now."""
+        return self._counts["connected"] - self._counts["left"]
+
+    def answered(self, timing: Mapping[str, float]) -> None:
+        """Note the `server_timing` of an answer; a part of 0 ms did not happen."""
+        with self._lock:
+            self._timings.note([timing[part] or math.nan for part in _TIMED])
+
+    def note(self, event: Event, robot: str, text: str = "") -> None:
+        """Count an event of the robot at this address, and write its line.
+
+        No line is written of a stranger who is turned away.
+        """
+        text = "".join(c if c.isprintable() else " " for c in text)  # a client forges no line
+        time = datetime.now(UTC).isoformat(timespec="milliseconds")
+        record = {"time": time, "event": event, "robot": robot, "text": text}
+        with self._lock:
+            self._counts[event] += 1
+            if event in _REFUSALS:
+                self._refusals.append(record)
+            elif event == "warning":
+                self._warnings.append(record)
+        if event != "turned away":
+            with suppress(OSError):  # a log that is full or gone stops no robot
+                self._say(f"{time} {robot} {event}{': ' if text else ''}{text}")
+
+    def json(self) -> str:
+        """The content of `/status.json`."""
+        with self._lock:
+            counts = {
+                "connected": self.connected,
+                "answered": self._timings.count,
+                "refused": self._counts["refused"] + self._counts["error"],
+            }
+            document = {
+                "policy": self._policy,
+                "seconds": monotonic() - self._since_s,
+                "counts": counts,
+                "latency": self._timings.document(),
+                "refusals": [*self._refusals],
+                "warnings": [*self._warnings],
+            }
+        return json.dumps(document)
 
 
 def read_token(params: ServeParams) -> str | None:
@@ -78,12 +143,11 @@ def listen(params: ServeParams) -> socket.socket:
     Raises `ConfigError` if the address is not one of this machine, or is taken.
     """
     with ExitStack() as undo:
+        family = socket.AF_INET6 if ":" in params.host else socket.AF_INET
+        bound = undo.enter_context(socket.socket(family))
+        bound.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
-            known = socket.getaddrinfo(params.host, params.port, type=socket.SOCK_STREAM)
-            family, *_, address = min(known, key=lambda entry: entry[0])
-            bound = undo.enter_context(socket.socket(family))
-            bound.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            bound.bind(address)
+            bound.bind((params.host, params.port))
         except OSError as error:
             raise ConfigError(
                 f"serve.port: {params.host}:{params.port}: {error.strerror}. Give an address of "
@@ -109,15 +173,9 @@ class PolicyServer:
         self._socket = bound
         host, port = bound.getsockname()[:2]
         self.address = f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
-        self.status = ServerStatus(served.metadata, say, params.log)
-        self._key_map = None if params.transform is None else KEY_MAPS[params.transform]
-        if self._key_map is not None:
-            self._key_map.refuse_more(served.metadata["streams"]["views"])
-        self._metadata = served.metadata | {"transform": params.transform}
-        self._allowed_ms = allowed_ms(served.metadata["horizon"], served.metadata["action_hz"])
+        self.status = ServerStatus(served.metadata, say)
         # One thread a robot, which has at most one unanswered observation.
         self._threads = ThreadPoolExecutor(params.max_connections, "robot")
-        self._answering = 0
         self._idle: set[ServerConnection] = set()
         self._stopping = False
         self._stop: Callable[[], object] = lambda: None
@@ -176,8 +234,8 @@ class PolicyServer:
         try:
             # Counted until its last observation is answered, which may be after it has left.
             self.status.note("connected", robot)
-            await connection.send(wire.pack(self._metadata))
-            session = self._served.session(self._params.fresh, self._params.seed, self._key_map)
+            await connection.send(wire.pack(self._served.metadata))
+            session = self._served.session(self._params.fresh, self._params.seed)
             code = None
             while code is None and not self._stopping:
                 message = await self._next(connection)
@@ -218,10 +276,9 @@ class PolicyServer:
         if isinstance(message, str):
             why = "refused: expected a message of bytes (msgpack), found a text"
             return why, CloseCode.UNSUPPORTED_DATA
-        loop, busy = asyncio.get_running_loop(), self._answering >= self._params.max_waiting
-        self._answering += 1
+        loop = asyncio.get_running_loop()
         try:
-            work = (self._think, message, session, robot, busy)
+            work = (self._think, message, session, robot)
             return await loop.run_in_executor(self._threads, *work), None
         except WireError as error:
             return f"refused: {_line(error)}", CloseCode.INVALID_DATA
@@ -233,24 +290,16 @@ class PolicyServer:
             traceback.print_exception(error, file=sys.stderr)
             why = f"error: {type(error).__name__}: the server's output says more"
             return why, CloseCode.INTERNAL_ERROR
-        finally:
-            self._answering -= 1
 
-    def _think(self, message: bytes, session: Session, robot: str, busy: bool) -> str | bytes:
+    def _think(self, message: bytes, session: Session, robot: str) -> bytes:
         """The answer to a message, in a thread of its own."""
         observation = session.take(wire.unpack(message, self._params.max_message_mb * 2**20))
-        if busy:
-            waiting = self._params.max_waiting
-            return f"busy: {waiting} observations are waiting; the readings were taken"
         if observation.reset:
             self.status.note("episode", robot, observation.prompt or "")
         answer = session.answer(observation)
         self.status.answered(answer["server_timing"])
         for warning in answer.get("warnings", ()):
             self.status.note("warning", robot, warning)
-        if (spent_ms := answer["server_timing"]["infer_ms"]) > self._allowed_ms:
-            half = f"half of a chunk is {self._allowed_ms:.0f} ms"
-            self.status.note("slow", robot, f"an answer took {spent_ms:.0f} ms, {half}")
         if "feature_key" in answer:
             # Bytes, not an array: openpi's chunk broker indexes every array by step.
             answer["feature_key"] = answer["feature_key"].tobytes()
@@ -258,58 +307,36 @@ class PolicyServer:
 
     async def _respond(self, connection: ServerConnection, request: Request) -> Response | None:
         """The answer to an HTTP request; None where it opens a websocket."""
-        headers = request.headers
+        path = request.path.partition("?")[0]
 
         def respond(status: HTTPStatus, text: str, **headers: str) -> Response:
             if status in _TURNED_AWAY:
                 self.status.note("turned away", _address(connection), text)
             return _response(connection, status, f"{text}\n", **headers)
 
-        try:
-            path, foreign = urlsplit(request.path).path, self._is_foreign(headers)
-            authorized = self._authorized(headers)
-            opens = path == "/" and headers.get("Upgrade", "").lower() == "websocket"
-        except MultipleValuesError as error:
-            why = f"expected the header {error} once, found several"
-            return respond(HTTPStatus.BAD_REQUEST, why)
-        except ValueError as error:
-            why = f"expected addresses in the path and Host, found another: {error}"
-            return respond(HTTPStatus.BAD_REQUEST, why)
         if path == "/healthz":
             return respond(HTTPStatus.OK, "OK")
-        if "Origin" in headers:
+        if "Origin" in request.headers:
             return respond(HTTPStatus.FORBIDDEN, "web pages are not served")
-        if foreign:
-            why = (
-                f"expected Host localhost, found {shown(headers.get('Host'))}: by other names only "
-                "a server with a token is asked (serve.token_file)"
-            )
-            return respond(HTTPStatus.FORBIDDEN, why)
-        if not authorized:
+        if not self._is_authorized(request):
             why = "expected the header Authorization: Api-Key <the server's token>"
             return respond(HTTPStatus.UNAUTHORIZED, why, **{"WWW-Authenticate": "Api-Key"})
         if path == "/status.json":
             kind = {"Content-Type": "application/json"}
             return respond(HTTPStatus.OK, self.status.json(), **kind)
-        if not opens:
+        if path != "/":
             why = "expected a websocket at /, /healthz or /status.json"
             return respond(HTTPStatus.NOT_FOUND, why)
         if self.status.connected >= (most := self._params.max_connections):
-            why = f"busy: {most} robots are connected (serve.max_connections)"
+            why = f"{most} robots are connected, as many as serve.max_connections allows"
             return respond(HTTPStatus.SERVICE_UNAVAILABLE, why)
         return None
 
-    def _is_foreign(self, headers: Headers) -> bool:
-        """Whether a name in `Host` was made to point to this machine, for a web page in a browser.
-
-        It is checked only without a token.
-        """
-        host = urlsplit(f"//{headers.get('Host', '')}").hostname
-        return self._token is None and not _is_loopback(host or "")
-
-    def _authorized(self, headers: Headers) -> bool:
-        given = headers.get("Authorization", "").encode()
-        return self._token is None or hmac.compare_digest(given, f"Api-Key {self._token}".encode())
+    def _is_authorized(self, request: Request) -> bool:
+        if self._token is None:
+            return True
+        given = ",".join(request.headers.get_all("Authorization")).encode()
+        return hmac.compare_digest(given, f"Api-Key {self._token}".encode())
 
 
 def _response(

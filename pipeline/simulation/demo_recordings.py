@@ -2,29 +2,28 @@
 
     raw/<task>/data_collection_…   new/<task>/episode_…   old/<task>/recv_all_…   lerobot/
 
-`demo.json` names the seed and version that wrote the sets, and digests of the sets: finished sets
-are kept, sets of other params are replaced, and files that the demo did not write are never
-touched.
+`demo.json` names the seed and version that wrote them, and their digest. A demo appears whole or
+not at all; a finished one is kept, one of other params is replaced, and one to which somebody else
+added files is refused.
 """
 
 import os
-from collections.abc import Callable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor, as_completed
+from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
 from threading import Event
-from typing import Any, Final, Literal
+from typing import Any, Final
 
 import numpy as np
-from pydantic import Field
 from tqdm import tqdm
 
 from pipeline.base import files
 from pipeline.base.border import Border, Document, Text
 from pipeline.base.digests import joint_digest
 from pipeline.base.errors import ConfigError
-from pipeline.base.files import OutputKind, disk_full_named, remove_folder, there, write_document
+from pipeline.base.files import OutputKind, recover_folder, replace_folder, write_document
 from pipeline.simulation.insertion_formats import (
     ABUTTING,
     OVERLAPPING,
@@ -39,8 +38,7 @@ DEMO_VERSION: Final = 2
 """Raise it whenever the same seed gives other recordings."""
 MARKER: Final = "demo.json"
 _MARKERS: Final = {MARKER, files.MARKER}
-DEMO: Final = OutputKind("what the demo wrote", lambda folder: (folder / MARKER).is_file())
-_SET: Final = OutputKind("a set of the demo's", lambda folder: DEMO.is_one(folder.parent))
+DEMO: Final = OutputKind("a demo", lambda folder: (folder / MARKER).is_file())
 TASK: Final = "Insert_the_needle_at_the_red_point"
 """The recorder names its folders after the instruction, which is the same in every format."""
 
@@ -57,9 +55,8 @@ class _Marker(Document):
     version: int = 0
     episodes: int = 0
     seed: int = 0
-    sets: tuple[Literal["raw", "new", "old", "lerobot"], ...] = ()
-    contents: dict[Text, Text] = Field(default_factory=dict)
-    """`contents_digest` of each set when it was written; "" is the checkpoint beside the marker."""
+    digest: Text = ""
+    """`contents_digest` of the folder when it was written."""
 
 
 Episodes = Iterator[SimulatedEpisode]
@@ -69,43 +66,64 @@ Write = Callable[[Path, Episodes], None]
 def write_demo_recordings(root: Path, episodes: int, seed: int) -> None:
     """Write `episodes` simulated episodes in each of the four formats to `root`.
 
-    Each set appears whole or not at all; a set that is already there stays as it is. The same
-    arguments give the same bytes. Raises `ConfigError` where `root` holds something that the demo
-    did not write, `DiskFull` where the disk is full.
+    The same arguments give the same bytes, and a folder that they wrote is kept. Raises as
+    `replace_demo`.
     """
     wanted = {"version": DEMO_VERSION, "episodes": episodes, "seed": seed}
-    finished = _finished_sets(root, wanted)
-    with disk_full_named(root):
-        root.mkdir(parents=True, exist_ok=True)
-        _mark(root, wanted, finished)
-        for name in _write_sets(root, finished, episodes, seed):
-            (root / f".{name}.part").rename(root / name)
-            finished.append(name)
-            _mark(root, wanted, finished)
+    if (root / MARKER).exists() and all((root / name).is_dir() for name in _SETS):
+        marked = BORDER.read_json(root / MARKER, _Marker)
+        if marked.model_dump(include={*wanted}) == wanted:
+            return
+    write = partial(_write_sets, episodes=episodes, seed=seed)
+    replace_demo(root, wanted, write)
 
 
-def _write_sets(root: Path, finished: list[str], episodes: int, seed: int) -> Iterator[str]:
-    """Write the unfinished sets, with a thread for each core; yields each name when it is written.
+def replace_demo(folder: Path, wanted: Mapping[str, int], write: Callable[[Path], None]) -> None:
+    """Replace a folder of the demo by what `write` writes, marked with `wanted`.
+
+    Raises `ConfigError` where `folder` holds something that the demo did not write, `DiskFull`
+    where the disk is full.
+    """
+    recover_folder(folder, DEMO)
+    if (folder / MARKER).exists():
+        marked = BORDER.read_json(folder / MARKER, _Marker)
+        if contents_digest(folder) != marked.digest:
+            raise ConfigError(
+                f"{folder}: expected the files that the demo wrote, found others or changed ones. "
+                "It was left as it is: move it away, or remove it"
+            )
+
+    def write_marked(place: Path) -> None:
+        write(place)
+        write_document(place / MARKER, {**wanted, "digest": contents_digest(place)})
+
+    replace_folder(folder, write_marked, DEMO)
+
+
+def contents_digest(folder: Path) -> str:
+    """Digest of names and sizes of the files below a folder, markers left out."""
+    files = (path for path in folder.rglob("*") if path.is_file() and path.name not in _MARKERS)
+    named = (f"{path.relative_to(folder)} {path.stat().st_size}" for path in files)
+    return joint_digest(*sorted(named))
+
+
+def _write_sets(root: Path, episodes: int, seed: int) -> None:
+    """Write the sets, with a thread for each core.
 
     Threads are enough: compressing and drawing, which take most of the time, run in parallel.
     """
-    stop = Event()
-    missing = {name: number for number, name in enumerate(_SETS) if name not in finished}
-    total, done = len(_SETS) * episodes, len(finished) * episodes
+    stop, total = Event(), len(_SETS) * episodes
     with (
-        tqdm(None, "simulating", total, initial=done, unit="episode", disable=None) as progress,
+        tqdm(None, "simulating", total, unit="episode", disable=None) as progress,
         ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool,
     ):
-        writing: dict[Future[None], str] = {}
+        writing = [
+            pool.submit(write, root / name, _simulated(number, episodes, seed, progress, stop))
+            for number, (name, write) in enumerate(_SETS.items())
+        ]
         try:
-            for name, number in missing.items():
-                part = root / f".{name}.part"
-                remove_folder(part, _SET)
-                simulated = _simulated(number, episodes, seed, progress, stop)
-                writing[pool.submit(_SETS[name], part, simulated)] = name
             for written in as_completed(writing):
                 written.result()
-                yield writing[written]
         finally:
             stop.set()
             pool.shutdown(cancel_futures=True)
@@ -144,61 +162,3 @@ _SETS: Final[dict[str, Write]] = {
     "old": partial(_write_episodes, write_old),
     "lerobot": write_lerobot,
 }
-
-
-def _finished_sets(root: Path, wanted: dict[str, int]) -> list[str]:
-    """The sets that are there as `wanted`; removes the demo's sets of other params."""
-    refuse_foreign(root, "demo.recordings")
-    path = root / MARKER
-    if not path.exists():
-        return []
-    marked = BORDER.read_json(path, _Marker)
-    written = [name for name in marked.sets if (root / name).is_dir()]
-    strange = [name for name in _SETS if (root / name).exists() and name not in written]
-    if strange:
-        raise ConfigError(
-            f"{root}: {MARKER} does not list {', '.join(strange)} as the demo's, so it is not "
-            "replaced; move it away, or set demo.recordings to another folder"
-        )
-    if marked.model_dump(include={*wanted}) == wanted:
-        return written
-    for name in written:
-        _refuse_changed(root / name, marked.contents.get(name))
-    for name in written:
-        remove_folder(root / name, _SET)
-    return []
-
-
-def refuse_changed_checkpoint(folder: Path) -> None:
-    """Raise `ConfigError` where a demo's checkpoint holds other files than the demo wrote."""
-    if (folder / MARKER).exists():
-        _refuse_changed(folder, BORDER.read_json(folder / MARKER, _Marker).contents.get(""))
-
-
-def _refuse_changed(folder: Path, written: str | None) -> None:
-    if contents_digest(folder) != written:
-        raise ConfigError(
-            f"{folder}: expected the files that the demo wrote, found others or changed ones. It "
-            "was left as it is: move it away, or remove it"
-        )
-
-
-def contents_digest(folder: Path) -> str:
-    """Digest of names and sizes of the files below a folder, markers left out."""
-    files = (path for path in folder.rglob("*") if path.is_file() and path.name not in _MARKERS)
-    named = (f"{path.relative_to(folder)} {path.stat().st_size}" for path in files)
-    return joint_digest(*sorted(named))
-
-
-def refuse_foreign(folder: Path, setting: str) -> None:
-    """Raise `ConfigError` naming `setting` where `folder` has content that is not the demo's."""
-    if there(folder) and not DEMO.owns(folder):
-        raise ConfigError(
-            f"{folder} is there and has no {MARKER}: the demo did not write it and leaves it "
-            f"alone; move it away, or set {setting} to another folder"
-        )
-
-
-def _mark(root: Path, wanted: dict[str, int], finished: list[str]) -> None:
-    contents = {name: contents_digest(root / name) for name in finished}
-    write_document(root / MARKER, {**wanted, "sets": finished, "contents": contents})

@@ -1,5 +1,7 @@
 """The needle insertion as a gymnasium environment, and as a robot that keeps pace with a clock.
 
+`environment_maker` makes this and every other environment by name.
+
 Frames have the clocks of a real arm's cameras. The simulation has ticks of 0.1 s only. At a higher
 rate the world of `SimulatedRobot` is faster than the real one: at 100 Hz, ten simulated seconds
 pass in a real one. It gives all times in real seconds, so its clock keeps pace with the monotonic
@@ -9,7 +11,7 @@ one: readings that are 1.5 ms apart in the simulation are then 0.15 ms apart.
 import math
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final, get_args
 
 import gymnasium
@@ -18,6 +20,8 @@ from gymnasium.spaces import Box, Dict
 from numpy.typing import NDArray
 
 from pipeline.base.config import PHANTOM, Level
+from pipeline.base.errors import ConfigError
+from pipeline.base.named import make_named
 from pipeline.data.insertion import SENSOR, STATE
 from pipeline.data.timeline import ActionRotation, pose_channels
 from pipeline.simulation.insertion import (
@@ -270,3 +274,31 @@ class SimulatedRobot:
     def _robot_time_s(self, time_s: Any) -> Any:
         """Converts times of the episode to the robot's clock, on which its first tick ends at 0."""
         return self._scale * (time_s - TICK_S)
+
+
+def environment_maker(
+    name: str, level: Level, action_names: Sequence[str]
+) -> Callable[[], RobotEnvironment]:
+    """Makes environments of this name: `phantom`, `metaworld:TASK`, or `module:name` of the user.
+
+    `level` is the phantom's, whose rotations follow those of the policy's `action_names`.
+    """
+    kind, _, task = name.partition(":")
+    if name == PHANTOM:
+        rotation = "rotvec" if "rx" in action_names else "euler_delta"
+        return lambda: InsertionEnvironment(level, rotation, cameras=False)
+    if kind == "metaworld":
+        from pipeline.simulation.meta_world import MetaWorldEnvironment
+
+        return lambda: MetaWorldEnvironment(task)
+    return lambda: _of_the_user(name)
+
+
+def _of_the_user(name: str) -> RobotEnvironment:
+    made = make_named("rollout.environment", name)
+    if not isinstance(made, RobotEnvironment):
+        raise ConfigError(
+            f"rollout.environment: {name}: expected a RobotEnvironment "
+            f"(pipeline.simulation.interface), found {type(made).__name__}"
+        )
+    return made

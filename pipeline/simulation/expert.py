@@ -7,7 +7,6 @@ it and cannot tell the two places apart would hover. It acts on the target's pla
 ago, which the newest frames show.
 """
 
-from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
@@ -26,47 +25,38 @@ _SMOOTHING = 0.5
 """Share of the velocity that carries over from the last tick."""
 
 
-@dataclass(frozen=True)
-class Percept:
-    """What the demonstrator knows when it acts.
+def expert_motion(
+    offset_mm: NDArray[np.float64],
+    distance_mm: float,
+    layer_mm: float,
+    inside: bool,
+    turn_deg: NDArray[np.float64],
+    velocity: NDArray[np.float64],
+    speed_mm_s: float,
+    tick_s: float,
+    rng: np.random.Generator,
+) -> NDArray[np.float64]:
+    """The motion (6,) of one tick: translation in mm, rotation vector in degrees, base frame.
 
     `offset_mm` (2,) is from needle to target, `distance_mm` from tip to surface and `layer_mm` from
     tip to target layer; `inside` is whether the tip is in the tissue, `turn_deg` (3,) the rotation
     vector to the upright, and `velocity` (6,) the arm's motion in the last tick.
     """
-
-    offset_mm: NDArray[np.float64]
-    distance_mm: float
-    layer_mm: float
-    inside: bool
-    turn_deg: NDArray[np.float64]
-    velocity: NDArray[np.float64]
-
-
-def expert_motion(
-    seen: Percept, speed_mm_s: float, tick_s: float, rng: np.random.Generator
-) -> NDArray[np.float64]:
-    """The motion (6,) of one tick: translation in mm, rotation vector in degrees, base frame."""
-    lateral = (
-        np.zeros(2) if seen.inside else _limited(_LATERAL_GAIN_HZ * seen.offset_mm, speed_mm_s)
-    )
-    turn = _limited(_TURN_GAIN_HZ * seen.turn_deg, _TURN_DEG_S)
-    wanted = np.concatenate([lateral, [_vertical_mm_s(seen)], turn]) * tick_s
-    motion = _SMOOTHING * seen.velocity + (1 - _SMOOTHING) * wanted
+    lateral = np.zeros(2) if inside else _limited(_LATERAL_GAIN_HZ * offset_mm, speed_mm_s)
+    if inside:
+        downward = np.clip(_LAYER_GAIN_HZ * layer_mm, -_INSERTION_MM_S, _INSERTION_MM_S)
+    else:
+        approach = np.clip(_APPROACH_GAIN_HZ * (distance_mm - STANDOFF_MM), 0, _DESCENT_MM_S)
+        miss = float(np.hypot(*offset_mm))
+        aligned = np.clip((NOT_ALIGNED_MM - miss) / (NOT_ALIGNED_MM - ALIGNED_MM), 0, 1)
+        downward = max(approach, aligned * _INSERTION_MM_S)
+    turn = _limited(_TURN_GAIN_HZ * turn_deg, _TURN_DEG_S)
+    wanted = np.concatenate([lateral, [-float(downward)], turn]) * tick_s
+    motion = _SMOOTHING * velocity + (1 - _SMOOTHING) * wanted
     tremor = rng.standard_normal(6) * np.repeat([_TREMOR_MM, _TREMOR_DEG], 3)
     # Tissue holds a needle that is inside it.
-    tremor[:2] *= not seen.inside
+    tremor[:2] *= not inside
     return motion + tremor
-
-
-def _vertical_mm_s(seen: Percept) -> float:
-    if seen.inside:
-        limit = _INSERTION_MM_S
-        return -float(np.clip(_LAYER_GAIN_HZ * seen.layer_mm, -limit, limit))
-    approach = np.clip(_APPROACH_GAIN_HZ * (seen.distance_mm - STANDOFF_MM), 0, _DESCENT_MM_S)
-    miss = float(np.hypot(*seen.offset_mm))
-    aligned = np.clip((NOT_ALIGNED_MM - miss) / (NOT_ALIGNED_MM - ALIGNED_MM), 0, 1)
-    return -float(max(approach, aligned * _INSERTION_MM_S))
 
 
 def _limited(velocity: NDArray[np.float64], limit: float) -> NDArray[np.float64]:

@@ -34,7 +34,7 @@ from numpy.typing import NDArray
 from pipeline.base.config import Level
 from pipeline.data.timeline import ActionRotation, wrapped_deg
 from pipeline.simulation.arm import ArmMotion, angles_deg, moved, orientation, robot_state
-from pipeline.simulation.expert import REACTION_TICKS, Percept, expert_motion
+from pipeline.simulation.expert import REACTION_TICKS, expert_motion
 from pipeline.simulation.layout import InsertionLayout, draw_layout
 from pipeline.simulation.needle_sensor import READING_HZ, NeedleContact, NeedleSensor
 
@@ -269,16 +269,17 @@ class NeedleInsertion:
         before, now = self.knots[-2].pose, self.knots[-1].pose
         seen = self.knots[max(0, len(self.knots) - 1 - REACTION_TICKS)]
         spun = (orientation(now[3:]) * orientation(before[3:]).inv()).as_rotvec(degrees=True)
-        percept = Percept(
+        motion = expert_motion(
             offset_mm=seen.target_mm - (now[:2] - self.layout.bench_mm),
             distance_mm=float(now[2]) - self.knots[-1].surface_mm,
             layer_mm=self.knots[-1].layer_mm,
             inside=self.inside,
             turn_deg=(self._upright * orientation(now[3:]).inv()).as_rotvec(degrees=True),
             velocity=np.concatenate([now[:3] - before[:3], spun]),
+            speed_mm_s=self.layout.speed_mm_s,
+            tick_s=TICK_S,
+            rng=np.random.default_rng([self.layout.seed, 102, len(self.knots)]),
         )
-        rng = np.random.default_rng([self.layout.seed, 102, len(self.knots)])
-        motion = expert_motion(percept, self.layout.speed_mm_s, TICK_S, rng)
         if self.action_rotation == "euler_delta":
             motion[3:] = wrapped_deg(
                 angles_deg(orientation(moved(now, motion, "rotvec")[3:])) - now[3:]

@@ -132,6 +132,8 @@ def test_what_is_refused(minimal, override, message):
 def test_a_rule_over_a_section_does_not_print_the_section(minimal):
     with pytest.raises(ConfigError) as caught:
         load_params(minimal, ["train_head.split={val: 0.9}"])
+    with pytest.raises(ConfigError, match=r"val_fraction: is no longer a key, .* three ways"):
+        load_params(minimal, ["train_head.val_fraction=0.2"])
     _, line, _ = str(caught.value).splitlines()
     assert "{" not in line and len(line) < 120
 

@@ -17,7 +17,7 @@ from pipeline.evaluate.rollout_driver import roll_out
 from pipeline.evaluate.rollouts import Rollouts
 from pipeline.policy.observation import PolicyShape
 from pipeline.policy.policy import Policy
-from pipeline.simulation.environments import environment_maker
+from pipeline.simulation.environment import environment_maker
 from pipeline.simulation.interface import RobotEnvironment
 from tests.robot.conftest import DIM, SLOTS, Glance
 from tests.robot.conftest import build_policy as made
@@ -77,7 +77,9 @@ def driven(names: Any, act: Any = None, **source: Any) -> tuple[Rollouts, Glance
         {"environment": names, "episodes": 3, "chunking": "none", "ablations": ["features off"]}
     )
     load: Any = lambda: glance  # noqa: E731
-    return roll_out(cart, "models/cart", policy, load, wanted, act=act), glance
+    if act is not None:
+        policy.act = act
+    return roll_out(cart, "models/cart", policy, load, wanted), glance
 
 
 def towards_the_middle(observation: Any, *_: Any) -> torch.Tensor:

@@ -17,8 +17,8 @@ import pytest
 import torch
 from torch.export import ExportedProgram
 
-from pipeline.base.config import ExportParams, TrainHeadParams, load_params
-from pipeline.base.errors import CheckpointMismatch, ConfigError, NumericsError
+from pipeline.base.config import ExportParams, TrainHeadParams
+from pipeline.base.errors import ConfigError, NumericsError
 from pipeline.policy.checkpoint import PolicyCheckpoint
 from pipeline.policy.normalization import ChannelStatistics, Normalization
 from pipeline.policy.observation import PolicyShape
@@ -26,7 +26,6 @@ from pipeline.policy.policy import Policy
 from pipeline.policy.shape import Anchor, SlotPlace
 from pipeline.robot import export
 from pipeline.robot.export import (
-    ExportedHead,
     Head,
     export_head,
     onnx_runner,
@@ -207,33 +206,6 @@ def test_every_format_is_the_policy(kind: dict[str, Any], export_of) -> None:
         assert_same(onnx_runner(done.folder / "head.onnx"), done.checkpoint, 2e-5)
 
 
-@pytest.mark.extra
-@needs_onnx
-@pytest.mark.parametrize(
-    "kind", [FLOW, pytest.param({"model_type": "regression"}, marks=pytest.mark.slow)], ids=str
-)
-def test_an_exported_head_answers_for_its_policy_alone(kind, export_of, tmp_path):
-    checkpoint, folder, _ = export_of(kind)
-    head, policy = ExportedHead(folder, checkpoint), checkpoint.policy()
-    seen = random_inputs(checkpoint, policy, 3, seed=5)
-    seen.pop("noise", None)
-    observation: Any = SimpleNamespace(**seen)
-
-    def drawn() -> list[torch.Generator]:
-        return [torch.Generator().manual_seed(row) for row in range(3)]
-
-    expected = policy.act(observation, drawn())
-    torch.testing.assert_close(head.act(observation, drawn()), expected, rtol=0, atol=2e-5)
-    other = checkpoint_of(**FEATURES_ALONE)
-    with pytest.raises(CheckpointMismatch, match="the head of another checkpoint"):
-        ExportedHead(folder, other)
-    with pytest.raises(CheckpointMismatch, match=r"none/head\.onnx: .* found no such file"):
-        ExportedHead(folder / "none", checkpoint)
-    (tmp_path / "head.onnx").write_bytes(b"cut off")
-    with pytest.raises(CheckpointMismatch, match="It is damaged"):
-        ExportedHead(tmp_path, checkpoint)
-
-
 @pytest.mark.parametrize(
     ("kind", "draws"),
     [
@@ -304,33 +276,14 @@ def test_a_process_without_this_project_runs_it(export_of, tmp_path) -> None:
     torch.testing.assert_close(found, Head(policy)(**given), rtol=0, atol=1e-6)
 
 
-RUN = """
-import sys
-import numpy as np
-import onnxruntime
-session = onnxruntime.InferenceSession("head/head.onnx")
-assert "torch" not in sys.modules
-(actions,) = session.run(["actions"], dict(np.load("given.npz")))
-np.save("actions.npy", actions)
-print(session.get_modelmeta().custom_metadata_map["contract.json"])
-"""
-
-
 @pytest.mark.extra
 @needs_onnx
-def test_onnx_runtime_needs_no_torch_and_the_file_says_what_it_is(export_of, tmp_path) -> None:
-    checkpoint, folder, receipt = export_of(FLOW)
-    (tmp_path / "head").symlink_to(folder)
-    policy = checkpoint.policy()
-    given = random_inputs(checkpoint, policy, 2)
-    np.savez(tmp_path / "given.npz", **{name: value.numpy() for name, value in given.items()})
-    ran = subprocess.run(
-        [sys.executable, "-c", RUN], cwd=tmp_path, check=True, capture_output=True, text=True
-    )
-    found = torch.from_numpy(np.load(tmp_path / "actions.npy"))
-    torch.testing.assert_close(found, Head(policy)(**given), rtol=0, atol=2e-5)
-    assert json.loads(ran.stdout) == {n: v for n, v in receipt.items() if n != "files"}
-    assert str(Path(__file__).parents[2]).encode() not in (tmp_path / "head/head.onnx").read_bytes()
+def test_an_onnx_file_says_what_it_is_and_not_where_it_was_made(export_of) -> None:
+    _, folder, receipt = export_of(FLOW)
+    told = export.onnx_session(folder / "head.onnx").get_modelmeta().custom_metadata_map
+    contract = {name: value for name, value in receipt.items() if name != "files"}
+    assert json.loads(told["contract.json"]) == contract
+    assert str(Path(__file__).parents[2]).encode() not in (folder / "head.onnx").read_bytes()
 
 
 @pytest.mark.usefixtures("traced_once")
@@ -345,24 +298,12 @@ def test_a_file_that_is_off_is_refused_and_the_old_one_stays(tmp_path, monkeypat
         return lambda given: run(given) + np.float32(0.01)
 
     monkeypatch.setattr(export, "torch_runner", off)
-    with pytest.raises(NumericsError, match=r"at most 0.0001 training std.*random inputs.*0.01"):
+    with pytest.raises(
+        NumericsError, match=r"at most 0.0001 training std.*found 0.0084 over random inputs"
+    ):
         exported(folder, checkpoint, "torch")
     assert (folder / "head.pt2").read_bytes() == before
     assert not folder.with_name("head.new").exists()
-    monkeypatch.setattr(export, "torch_runner", lambda path: lambda given: honest(path)(given) / 0)
-    with (
-        np.errstate(divide="ignore", invalid="ignore"),
-        pytest.raises(NumericsError, match="found inf over random inputs"),
-    ):
-        exported(folder, checkpoint, "torch")
-
-
-@pytest.mark.usefixtures("traced_once")
-def test_a_missing_package_is_named(tmp_path, monkeypatch) -> None:
-    monkeypatch.setitem(sys.modules, "onnxscript", None)
-    with pytest.raises(ConfigError, match=r"onnxscript .*pip install .*\[export\]"):
-        exported(tmp_path / "head", checkpoint_of(**FEATURES_ALONE), "onnx")
-    exported(tmp_path / "head", checkpoint_of(**FEATURES_ALONE), "torch")
 
 
 def test_somebody_elses_folder_is_left_alone(tmp_path) -> None:
@@ -387,9 +328,3 @@ def test_golden_rows_are_judged_too(tmp_path) -> None:
     rows[0].features[0, 0] = np.nan
     with pytest.raises(NumericsError, match="found nan over golden inputs"):
         exported(tmp_path / "head", checkpoint, "torch")
-
-
-def test_int8_is_no_longer_a_key(tmp_path) -> None:
-    (tmp_path / "params.yaml").write_text("data: {sources: []}\nvlm: {checkpoint: model}\n")
-    with pytest.raises(ConfigError, match=r"export\.int8: is no longer a key: .* Remove it"):
-        load_params(tmp_path / "params.yaml", ["export.int8=false"])

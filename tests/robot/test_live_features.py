@@ -19,7 +19,6 @@ from pipeline.store import FeatureStore
 from pipeline.vlm.demo_checkpoint import write_demo_checkpoint
 from pipeline.vlm.live import LiveVLM
 from pipeline.vlm.preparation import Preparer
-from pipeline.vlm.processor import PromptRenderer
 from pipeline.vlm.slots import TOLERANCES
 
 Frames = Mapping[str, np.ndarray]
@@ -59,23 +58,17 @@ def test_other_features_are_refused_before_a_weight_is_loaded(params, monkeypatc
         LiveFeatures(params.vlm.model_copy(update=changed), trained, "cpu")
 
 
-@pytest.mark.parametrize("what", ["weights", "adapter"])
-def test_another_model_is_refused_before_a_weight_is_loaded(params, tmp_path, monkeypatch, what):
+def test_another_model_is_refused_before_a_weight_is_loaded(params, tmp_path, monkeypatch):
     monkeypatch.setattr(LiveVLM, "load", None)
     trained = FeatureStore.open(params.extract.store).spec
-    if what == "weights":
-        other = tmp_path / "other"
-        write_demo_checkpoint(other)
-        (weights,) = other.glob("*.safetensors")
-        tensors = load_file(weights)
-        name = next(iter(tensors))
-        save_file(tensors | {name: tensors[name] * 1.5}, weights, {"format": "pt"})
-        vlm = params.vlm.model_copy(update={"checkpoint": str(other)})
-    else:
-        (tmp_path / "adapter_config.json").write_text('{"peft_type": "LORA", "r": 1}')
-        save_file({"one": torch.zeros(1)}, tmp_path / "adapter_model.safetensors")
-        vlm = params.vlm.model_copy(update={"adapter": str(tmp_path)})
-    with pytest.raises(CheckpointMismatch, match=rf"{what}: .* -> "):
+    other = tmp_path / "other"
+    write_demo_checkpoint(other)
+    (weights,) = other.glob("*.safetensors")
+    tensors = load_file(weights)
+    name = next(iter(tensors))
+    save_file(tensors | {name: tensors[name] * 1.5}, weights, {"format": "pt"})
+    vlm = params.vlm.model_copy(update={"checkpoint": str(other)})
+    with pytest.raises(CheckpointMismatch, match=r"weights: .* -> "):
         LiveFeatures(vlm, trained, "cpu")
 
 
@@ -147,8 +140,7 @@ class TestRefused:
         assert "4 of 4 golden rows are not the features that the policy was trained on" in said
         assert "slots deviate by more than 1e-03 of their size" in said
         assert "layer 3 mean " in said or "layer 3 grid View" in said
-        assert "and 43 more" in said
-        assert "The feature specs agree in every entry" in said
+        assert "and 43 more" in said and "The feature specs agree" in said
 
     def test_a_model_that_gives_no_numbers(self, checkpoint, live):
         with torch.no_grad():
@@ -159,10 +151,9 @@ class TestRefused:
         "change",
         [
             lambda frames: {v: f[..., ::-1] for v, f in frames.items()},
-            lambda f: {**f, "View1": f["View2"], "View2": f["View1"]} if f else f,
             lambda frames: {v: f[::2, ::2].repeat(2, 0).repeat(2, 1) for v, f in frames.items()},
         ],
-        ids=["red and blue exchanged", "views exchanged", "another resize"],
+        ids=["red and blue exchanged", "another resize"],
     )
     def test_other_frames_on_the_way_to_the_model(self, checkpoint, live, monkeypatch, change):
         broken(monkeypatch, change)
@@ -172,30 +163,6 @@ class TestRefused:
     def test_a_view_that_is_lost_on_the_way_to_the_model(self, checkpoint, live, monkeypatch):
         broken(monkeypatch, lambda frames: {v: f for v, f in frames.items() if v != "View5"})
         assert "grid View5 0,0 is missing in one of both" in refusal(checkpoint, live)
-
-    def test_another_rendering_of_the_prompt_is_shown_beside_that_of_training(
-        self, checkpoint, params, monkeypatch
-    ):
-        real, told = PromptRenderer.render, checkpoint.golden[0].instruction
-
-        def render(self: PromptRenderer, instruction: str, views: int) -> str:
-            marked = f"{instruction}!" if instruction == told else instruction  # no example of it
-            return real(self, marked, views)
-
-        monkeypatch.setattr(PromptRenderer, "render", render)
-        live = LiveFeatures(params.vlm, checkpoint.source["feature_spec"], "cpu")
-        said = refusal(checkpoint, live)
-        assert said.startswith("4 of 4 golden rows")
-        trained, now = (line for line in said.splitlines() if line.startswith("prompt, "))
-        assert f"{told}!" not in trained
-        assert f"{told}!" in now
-
-    def test_what_differs_in_the_spec_is_named(self, checkpoint, live):
-        other = {**checkpoint.source["feature_spec"], "tokenizer": "0123", "digest": "other"}
-        source = {**checkpoint.source, "feature_spec": other}
-        rows = tuple(replace(row, features=row.features + 1) for row in checkpoint.golden)
-        said = refusal(replace(checkpoint, source=source, golden=rows), live)
-        assert 'feature spec, tokenizer: "0123" -> ' in said
 
 
 def test_half_precision_tolerates_its_own_noise_and_no_more(params, checkpoint, live):

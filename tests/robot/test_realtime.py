@@ -5,7 +5,6 @@ comes when the policy's latency is over. `TestThreads` has the real clock and th
 """
 
 import gc
-import os
 import signal
 import sys
 import threading
@@ -20,7 +19,7 @@ import numpy as np
 import pytest
 
 from pipeline.base.config import LimitsFile
-from pipeline.base.errors import ConfigError, ServerBusy
+from pipeline.base.errors import ConfigError
 from pipeline.robot.limits import Limits
 from pipeline.robot.loop import StopKind
 from pipeline.robot.realtime import RunSettings, run_robot
@@ -166,17 +165,8 @@ def stopped(
     report = run_robot(arm, brain or Brain(), settings, limits, recorder)
     assert (report.kind, said in report.reason) == (kind, True), (report.kind, report.reason)
     assert report.reason in arm.stops
-    assert (np.abs(report.actions[:, 2:]) < 2).all()
+    assert (np.abs(np.array(arm.acts or [0.0])) < 2).all()
     return report
-
-
-def test_a_report_counts_features_older_than_in_training() -> None:
-    brain = Brain(
-        lambda n, answer: answer.update(feature_age_s=0.5 if n in (3, 4) else 0.3),
-        trained_age_s=0.3,
-    )
-    report = run_robot(Arm(), brain, replace(CALM, seconds=2.0))
-    assert len(brain.asked) > 4 and report.old_features == 2
 
 
 def after(tick: int, do: Callable[[Observed], Any]) -> Callable[[int, Observed], None]:
@@ -205,13 +195,9 @@ def test_a_run_asks_acts_and_records_until_its_time_is_up() -> None:
     # Until the first chunk is there nothing is played, so the next is not yet due.
     assert ticks_of(brain.asked) == [0, *range(2, 60)]
     assert (report.answers, len(arm.acts)) == (58, 59)
-    np.testing.assert_array_equal(report.actions[:, 0], np.arange(1, 60))
-    np.testing.assert_allclose(report.actions[:, 1], 2000 + np.arange(1, 60) / 200)
-    assert report.clock_offset_s == pytest.approx(AHEAD_S)
     # All readings are told once, and frames every third tick.
     states = np.concatenate([asked["state"][:, 0] for asked in brain.asked])
     np.testing.assert_array_equal(states, np.repeat(np.arange(len(states) / 2), 2))
-    assert report.dropped_readings == 0
     times = np.concatenate([asked["sensor_time"] for asked in brain.asked])
     assert (np.diff(times) > 0).all()
     assert brain.asked[0]["reset"] is True and not any("reset" in q for q in brain.asked[1:])
@@ -290,14 +276,13 @@ def test_what_limits_cut_off_is_made_up_for() -> None:
     assert report.clipped == 3
 
 
-def test_a_plan_that_is_used_up_stops_the_robot_and_says_how_long_answers_took() -> None:
+def test_a_plan_that_is_used_up_stops_the_robot() -> None:
     def answers(n: int, answer: Observed) -> None:
         brain.latency_s = 0.0 if n <= 2 else 1.0
 
     arm, brain = Arm(), Brain(answers)
     report = stopped(arm, StopKind.NO_CHUNK, "used up", brain)
     assert len(arm.acts) == HORIZON + 1 and report.answers == 2
-    assert "ms at most; half of a chunk is 100 ms" in report.reason
 
 
 def of_question(number: int, value: float) -> Callable[[int, Observed], None]:
@@ -326,7 +311,7 @@ def frame_of_age(age_s: float) -> Arm:
 
 
 ALL_TIMES = ("time", "state_time", "sensor_time")
-NAN, INF = np.full((2, 2), np.nan), np.array([[np.inf]])
+NAN = np.full((2, 2), np.nan)
 STOPS: dict[str, Callable[[], RunReport]] = {
     "a first chunk that never comes": lambda: stopped(
         Arm(), StopKind.NO_CHUNK, "first chunk", Brain().after(0.3), first_answer_s=0.1
@@ -338,9 +323,6 @@ STOPS: dict[str, Callable[[], RunReport]] = {
         Arm(), StopKind.LIMIT, "step of translation",
         Brain(lambda n, answer: answer.update(actions=np.full((HORIZON, 2), 9.0 * (n == 5)))),
         limits=limits(step={"most": {"translation": 2.0}}),
-    ),
-    "a declared offset that is wrong": lambda: stopped(
-        Arm(), StopKind.CLOCK, "the robot's clock is", clock_offset_s=0.0
     ),
     "features that stay old": lambda: stopped(
         Arm(), StopKind.OLD_FEATURES, "newest features",
@@ -355,15 +337,8 @@ STOPS: dict[str, Callable[[], RunReport]] = {
     ),
     "an old frame": lambda: stopped(frame_of_age(1.0), StopKind.CAMERA, "1.00 s old"),
     "a frame of the future": lambda: stopped(frame_of_age(-1.0), StopKind.CAMERA, "-1.00 s old"),
-    "readings that keep their time": lambda: stopped(
-        Arm(after(9, put("sensor_time", np.array([2000.045])))), StopKind.STALLED, "sensor",
-        stalled_s=0.15,
-    ),
     "a state that is no number": lambda: stopped(
         Arm(after(9, put("state", NAN))), StopKind.NOT_A_NUMBER, "state"
-    ),
-    "a sensor that is infinite": lambda: stopped(
-        Arm(after(9, put("sensor", INF))), StopKind.NOT_A_NUMBER, "sensor"
     ),
     "a chunk of another shape": lambda: stopped(
         Arm(), StopKind.POLICY, "(40, 2), found (40, 3)",
@@ -387,9 +362,6 @@ STOPS: dict[str, Callable[[], RunReport]] = {
     "a clock that leaps": lambda: stopped(
         Arm(after(15, moved(1, *ALL_TIMES))), StopKind.CLOCK, "clock is +1.000 s from"
     ),
-    "a clock that is set back": lambda: stopped(
-        Arm(after(15, moved(-1, *ALL_TIMES))), StopKind.CLOCK, "clock is -1.000 s from"
-    ),
     "slow ticks": lambda: stopped(
         Arm(moves=lambda tick: time.sleep(0.05) if tick >= 5 else None), StopKind.MISSED, "'act'"
     ),
@@ -403,12 +375,6 @@ STOPS: dict[str, Callable[[], RunReport]] = {
     "a recorder that fails": lambda: stopped(
         Arm(), StopKind.RECORDER, "disk full", recorder=Notes(OSError("disk full"))
     ),
-    "Ctrl-C": lambda: stopped(
-        Arm(moves=fail_at(7, KeyboardInterrupt())), StopKind.BY_HAND, "stopped by hand (SIGINT)"
-    ),
-    "no more to do": lambda: stopped(
-        Arm(after(9, put("ended", "inserted"))), StopKind.ENDED, "inserted"
-    ),
 }  # fmt: skip
 """What ends a run by itself, before its time is up."""
 
@@ -416,30 +382,6 @@ STOPS: dict[str, Callable[[], RunReport]] = {
 @pytest.mark.parametrize("stop", STOPS.values(), ids=STOPS)
 def test_whatever_goes_wrong_stops_the_robot(stop: Callable[[], RunReport]) -> None:
     stop()
-
-
-def test_a_busy_server_is_asked_again_with_its_frames_and_the_readings_that_follow() -> None:
-    def busy(n: int, answer: Observed) -> None:
-        if n in (1, 8, 9):
-            raise ServerBusy("busy: 8 observations are waiting")
-
-    arm, brain = Arm(after(60, put("ended", "enough"))), Brain(busy)
-    report = run_robot(arm, brain, replace(CALM, seconds=20))
-    assert (report.kind, report.busy) == (StopKind.ENDED, 3) and arm.acts
-    assert "images/View1" in brain.asked[0] and "images/View1" in brain.asked[1]
-    states = np.concatenate([asked["state"][:, 0] for asked in brain.asked])
-    np.testing.assert_array_equal(states, np.repeat(np.arange(len(states) / 2), 2))
-
-
-def test_a_server_that_stays_busy_stops_the_robot() -> None:
-    def busy(n: int, answer: Observed) -> None:
-        if n > since:
-            raise ServerBusy("busy: 8 observations are waiting")
-
-    since = 0
-    stopped(Arm(), StopKind.NO_CHUNK, "first chunk", Brain(busy), first_answer_s=0.1)
-    since = 5
-    stopped(Arm(), StopKind.NO_CHUNK, "used up", Brain(busy))
 
 
 def without_sensor(observed: Observed) -> None:
@@ -456,34 +398,18 @@ def test_a_stream_that_stalls_stops_the_robot_unless_nobody_watches_or_looks_at_
     assert all("sensor" not in asked and "state" in asked for asked in brain.asked)
 
 
-@pytest.mark.parametrize(
-    ("spoil", "kind"),
-    [
-        (without_sensor, StopKind.STALLED),
-        (put("sensor", np.array([[np.nan]], np.float32)), StopKind.NOT_A_NUMBER),
-    ],
-)
-def test_a_stream_that_limits_are_of_is_watched_whatever_the_policy_looks_at(spoil, kind):
-    brain = Brain(looks_at=["features", "state"])
+def test_a_stream_that_limits_are_of_is_watched_whatever_the_policy_looks_at() -> None:
+    brain, arm = Brain(looks_at=["features", "state"]), Arm(after(9, without_sensor))
     force = limits(force={"most": {"force": 2.5}})
-    report = stopped(Arm(after(9, spoil)), kind, "sensor", brain, limits=force, stalled_s=0.15)
-    assert report.dropped_readings == 0 and all("sensor" not in asked for asked in brain.asked)
+    stopped(arm, StopKind.STALLED, "sensor", brain, limits=force, stalled_s=0.15)
+    assert all("sensor" not in asked for asked in brain.asked)
 
 
-def test_a_declared_offset_that_is_right_changes_nothing() -> None:
-    right = replace(CALM, clock_offset_s=AHEAD_S)
-    assert run_robot(Arm(), Brain(), right).kind == StopKind.TIME
-
-
-def test_one_slow_tick_is_counted_and_told_with_the_part_that_took_the_time() -> None:
+def test_one_slow_tick_is_counted() -> None:
     arm = Arm(moves=lambda tick: time.sleep(0.0525) if tick == 10 else None)
     report = run_robot(arm, Brain(), replace(CALM, missed_in_a_row=20))
-    (slow,) = report.missed
-    assert (slow.tick, slow.part, slow.left_out) == (11, "act", 10)
-    assert slow.late_ms == pytest.approx(47.5)
     assert (report.missed_ticks, report.left_out, report.ticks) == (1, 10, 50)
-    # No two actions of one tick, and none of those left out.
-    np.testing.assert_array_equal(report.actions[:, 0], [*range(1, 12), *range(22, 60)])
+    assert len(arm.acts) == 49, "no two actions of one tick, and none of those left out"
 
 
 @pytest.mark.parametrize("where", ["observe", "act", "frames"])
@@ -496,12 +422,10 @@ def test_an_exception_in_the_robots_code_stops_it_and_is_told(where: str) -> Non
     assert "raise error" in report.traceback
 
 
-ENDINGS = [
-    getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)
-]
+ENDINGS = [signal.SIGINT, signal.SIGTERM, signal.SIGHUP]
 
 
-@pytest.mark.parametrize("number", [*ENDINGS, None])
+@pytest.mark.parametrize("number", [signal.SIGTERM, None])
 def test_a_signal_stops_the_robot_and_none_breaks_off_the_stop(number: int | None) -> None:
     """None: the robot ends the run, and signals come only while it is stopped."""
 
@@ -520,12 +444,12 @@ def test_a_signal_stops_the_robot_and_none_breaks_off_the_stop(number: int | Non
     # If it fails, then not by ending the tests.
     kept = {each: signal.signal(each, signal.default_int_handler) for each in ENDINGS}
     try:
-        kind, said = StopKind.ENDED, "enough"
-        if number is not None:
-            kind, said = StopKind.BY_HAND, f"stopped by hand ({signal.Signals(number).name})"
-        arm, notes = Interrupted(end), Notes()
-        stopped(arm, kind, said, recorder=notes)
-        assert len(arm.stops) == 1 and notes.reason
+        arm = Interrupted(end)
+        if number is None:
+            stopped(arm, StopKind.ENDED, "enough")
+        else:
+            stopped(arm, StopKind.BY_HAND, "stopped by hand (SIGTERM)")
+        assert len(arm.stops) == 1
         assert all(signal.getsignal(each) is signal.default_int_handler for each in ENDINGS)
     finally:
         for each, handler in kept.items():
@@ -551,24 +475,20 @@ def test_a_run_on_another_thread_leaves_signals_alone() -> None:
 
 
 class Stubborn(Arm):
-    """Its `stop` fails so often."""
-
-    fails = 1
+    """Its first `stop` fails."""
 
     def stop(self, reason: str) -> None:
         super().stop(reason)
-        if len(self.stops) <= self.fails:
+        if len(self.stops) == 1:
             raise ConnectionError("bus off")
 
 
-@pytest.mark.parametrize("fails", [1, 99])
-def test_a_stop_that_fails_is_tried_again_and_hides_nothing(fails: int) -> None:
+def test_a_stop_that_fails_is_tried_again_and_hides_nothing() -> None:
     arm, notes = Stubborn(fail_at(6, RuntimeError("bus error"))), Notes()
-    arm.fails = fails
     report = stopped(arm, StopKind.ROBOT, "bus error", recorder=notes)
     assert len(arm.stops) == 2 and notes.reason == report.reason
     assert report.recording == Path("recording")
-    assert report.traceback.count("robot.stop failed: Traceback") == min(fails, 2)
+    assert report.traceback.count("robot.stop failed: Traceback") == 1
     assert "policy" not in {thread.name for thread in threading.enumerate()}
 
 
@@ -591,7 +511,6 @@ def test_a_recording_that_cannot_be_finished_hides_no_reason() -> None:
     [
         ("sensor", np.array([[-3.0]], np.float32), StopKind.FORCE),
         ("state", np.full((2, 2), np.nan, np.float32), StopKind.NOT_A_NUMBER),
-        ("time", np.array([0.0]), StopKind.CLOCK),
     ],
 )
 def test_the_tick_that_stops_the_robot_is_recorded(name: str, value: Any, kind: StopKind) -> None:
@@ -616,7 +535,6 @@ def test_an_action_that_the_robot_failed_at_is_recorded() -> None:
             StopKind.ROBOT,
             "state: expected (2, 2), found (2, 3)",
         ),
-        (lambda observed: observed.pop("state"), StopKind.LOOP, "KeyError: 'state'"),
         (put("state", np.array([[0.1, None], [0.1, None]], object)), StopKind.LOOP, "check"),
     ],
 )
@@ -656,20 +574,6 @@ def test_the_process_is_afterwards_as_it_was() -> None:
     run_robot(Arm(moves=look), Brain(), replace(CALM, seconds=0.05))
     assert before == (sys.getswitchinterval(), gc.isenabled())
     assert set(within) == {(5e-4, False)}
-
-
-@pytest.mark.parametrize("priority", [1, 100])
-def test_a_priority_that_the_policys_thread_cannot_go_below_is_refused(priority: int) -> None:
-    with pytest.raises(ConfigError, match=f"expected 0, or 2 to 99, found {priority}"):
-        run_robot(Arm(), Brain(), replace(CALM, fifo_priority=priority))
-
-
-def test_a_machine_without_a_scheduler_to_ask_runs_a_robot(monkeypatch) -> None:
-    for name in ("sched_getscheduler", "sched_getparam", "sched_setscheduler"):
-        monkeypatch.delattr(os, name, raising=False)
-    assert run_robot(Arm(), Brain(), replace(CALM, seconds=0.05)).kind == StopKind.TIME
-    with pytest.raises(ConfigError, match="does not grant priority 2"):
-        run_robot(Arm(), Brain(), replace(CALM, fifo_priority=2))
 
 
 def test_a_thousand_ticks_more_need_no_more_memory(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -752,24 +656,3 @@ class TestThreads:
         assert (report.kind, report.reason) == (StopKind.HUNG, "no tick has ended for 0.1 s")
         assert len(arm.stops) == 3
         assert report.traceback.count("robot.stop failed: Traceback") == 1
-
-    def test_the_loop_goes_before_other_threads_where_the_machine_grants_it(self) -> None:
-        def enough(tick: int, observed: Observed) -> None:
-            observed["ended"] = "enough" if arm.acts else None
-
-        def priority() -> tuple[int, int]:
-            return os.sched_getscheduler(0), os.sched_getparam(0).sched_priority
-
-        seen, asked = set[tuple[int, int]](), set[tuple[int, int]]()
-        first = replace(self.CALM, fifo_priority=2)
-        try:
-            os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))
-        except PermissionError:
-            with pytest.raises(ConfigError, match="fifo_priority: this machine does not grant"):
-                run_robot(Arm(), Brain(), first)
-            return
-        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
-        arm = Arm(enough, moves=lambda tick: seen.add(priority()))
-        run_robot(arm, Brain(lambda n, answer: asked.add(priority())), first)
-        assert seen == {(os.SCHED_FIFO, 2)} and asked == {(os.SCHED_FIFO, 1)}
-        assert os.sched_getscheduler(0) == os.SCHED_OTHER

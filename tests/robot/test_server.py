@@ -20,7 +20,6 @@ from pipeline.base.errors import ConfigError
 from pipeline.robot import wire
 from pipeline.robot.client import PolicyClient
 from pipeline.robot.server import PolicyServer, listen, read_token
-from pipeline.robot.server_status import ServerStatus
 
 
 def get(server: PolicyServer, path: str, **headers: str) -> tuple[int, str, dict[str, str]]:
@@ -72,7 +71,7 @@ def test_a_connection_is_one_memory_and_bit_for_bit_what_a_session_in_process_is
     served = served_policy("flow_matching")
     server, here = serving(served, seed=3), served.session(seed=3)
     with client_of(server) as client, client_of(server) as other:
-        assert client.metadata == served.metadata | {"transform": None}
+        assert client.metadata == served.metadata
         alone = [here.infer(observe(tick)) for tick in range(5)]
         for tick, own in enumerate(alone):
             there = client.infer(observe(tick))
@@ -83,8 +82,6 @@ def test_a_connection_is_one_memory_and_bit_for_bit_what_a_session_in_process_is
         for tick in range(2):
             theirs = other.infer(observe(tick))["actions"]
             np.testing.assert_array_equal(theirs, alone[tick]["actions"])
-        client.reconnect()
-        np.testing.assert_array_equal(client.infer(observe(0))["actions"], alone[0]["actions"])
 
 
 def test_observations_of_one_connection_are_answered_in_order(served_policy, serving, observe):
@@ -97,31 +94,18 @@ def test_observations_of_one_connection_are_answered_in_order(served_policy, ser
     np.testing.assert_allclose(ages, [0, 0.1, 0.2, 0, 0.1, 0.2, 0], atol=1e-6)
 
 
-def test_while_the_model_looks_healthz_answers_and_too_many_are_told_busy(
-    served_policy, serving, observe
-):
-    """The connection stays, and has taken the readings and the reset."""
+def test_while_the_model_looks_healthz_answers(served_policy, serving, observe):
     served = served_policy()
-    server = serving(served, max_waiting=1)
-    with client_of(server) as busy, client_of(server) as other:
-        other.infer(observe(0))
-        blocked = Blocked(served)
-        answers: list[Any] = []
-        thread = threading.Thread(target=lambda: answers.append(busy.infer(observe(0))))
+    server = serving(served)
+    with client_of(server) as client:
+        blocked, answers = Blocked(served), list[Any]()
+        thread = threading.Thread(target=lambda: answers.append(client.infer(observe(0))))
         thread.start()
         assert blocked.looking.wait(60)
         assert get(server, "/healthz")[:2] == (200, "OK\n")
-        other.reset()
-        with pytest.raises(ConnectionError, match="busy: 1 observations are waiting"):
-            other.infer(observe(1))
         blocked.go.set()
         thread.join()
-        assert answers[0]["actions"].shape == (4, 7)
-        session = served.session()
-        session.take(observe(1))
-        expected = session.infer(observe(2))["actions"]
-        np.testing.assert_array_equal(other.infer(observe(2))["actions"], expected)
-    assert json.loads(server.status.json())["counts"]["busy"] == 1
+    assert answers[0]["actions"].shape == (4, 7)
 
 
 def array_of(dtype: str, shape: Any, data: bytes) -> dict[bytes, Any]:
@@ -132,9 +116,7 @@ def array_of(dtype: str, shape: Any, data: bytes) -> dict[bytes, Any]:
     ("message", "said", "code"),
     [
         ("time", "refused: expected a message of bytes (msgpack), found a text", 1003),
-        (b"", "refused: expected a message in msgpack, found none", 1007),
         (msgpack.packb({"time": array_of("|O", [1], b"0")}), "refused: expected the dtype", 1007),
-        (msgpack.packb([1]), "refused: expected fields by name, found list", 1008),
         (wire.pack({"time": 0.1, "gripper": 1}), "refused: gripper: expected one of", 1008),
     ],
 )
@@ -153,79 +135,43 @@ def test_what_is_wrong_with_a_message_costs_its_connection_only(
     assert json.loads(server.status.json())["counts"]["refused"] == 1
 
 
-def test_each_event_is_a_line_and_status_says_what_happened(served_policy, serving, observe):
-    server: Any = serving(served_policy(), log="json")
-    assert json.loads(get(server, "/status.json")[1])["latency"] == {}
+def test_status_and_lines_say_what_happened(served_policy, serving, observe):
+    server: Any = serving(served_policy())
     with client_of(server) as client:
         client.reset()
-        client.infer(observe(0, prompt="go on"))
+        client.infer(observe(0, prompt="go\non"))
         client.infer(observe(1, state=np.zeros((1, 12)), state_time=[0.15]))
         shown = json.loads(get(server, "/status.json")[1])
-        assert shown["counts"] == {"connected": 1, "answered": 2, "refused": 0, "busy": 0}
+        assert shown["counts"] == {"connected": 1, "answered": 2, "refused": 0}
         assert shown["policy"]["checkpoint"] == "models/head"
         for part in ("vlm_ms", "head_ms", "wait_ms", "infer_ms"):
-            taken = shown["latency"][part]
-            assert 0 < taken["p50"] <= taken["p99"] <= taken["p99.9"] <= taken["max"]
-    for _ in range(3):
-        with opened(server) as bare:
-            bare.send(wire.pack({"gripper": 1}))
-            bare.recv(20)
-            assert closing_code(bare) == 1008
+            assert 0 < shown["latency"][part]["p50"] <= shown["latency"][part]["max"]
+    with opened(server) as bare:
+        bare.send(wire.pack({"gripper": 1}))
+        bare.recv(20)
+        assert closing_code(bare) == 1008
     assert get(server, "/status.json", Origin="http://elsewhere")[0] == 403
     _, text, headers = get(server, "/status.json")
     assert headers["Content-Type"] == "application/json" and headers["Cache-Control"]
     shown = json.loads(text)
-    assert shown["counts"]["refused"] == 3
     assert [(r["event"], r["text"].split(":")[0]) for r in shown["refusals"]] == [
         ("refused", "gripper"), ("turned away", "web pages are not served"),
     ]  # fmt: skip
     assert [w["text"].split(":")[0] for w in shown["warnings"]] == ["prompt", "state"]
-    lines = [json.loads(line) for line in server.lines]
-    events = [line["event"] for line in lines[:5]]
+    events = [line.split()[2].strip(":") for line in server.lines[:5]]
     assert events == ["connected", "episode", "warning", "warning", "left"]
-    assert lines[1]["text"] == "go on" and lines[4]["text"].startswith("2 answers in ")
-    assert sum(line["event"] == "refused" for line in lines) == 1, "the others are the same"
-
-
-def test_what_repeats_is_counted(served_policy, monkeypatch) -> None:
-    now_s, lines = [0.0], list[str]()
-    monkeypatch.setattr("pipeline.robot.server_status.monotonic", lambda: now_s[0])
-    status = ServerStatus(served_policy().metadata, lines.append)
-    for second in range(12):
-        now_s[0] = float(second)
-        status.note("slow", f"10.0.0.1:{second}", f"an answer took {second} ms")
-        status.note("slow", "10.0.0.2:1")
-        status.note("episode", "10.0.0.3:1", "go")
-    assert [line.split(" ", 1)[1] for line in lines if "10.0.0.1" in line] == [
-        "10.0.0.1:0 slow: an answer took 0 ms",
-        "10.0.0.1:10 slow: an answer took 10 ms (9 more like it)",
-    ]
-    assert sum("10.0.0.3:1 episode: go" in line for line in lines) == 12
-    for reason in range(2000):
-        status.note("refused", "10.0.0.1:1", f"{reason}\n{reason}")
-    assert "\n" not in "".join(lines)
-    assert len(status._written) <= 1000 and len(json.loads(status.json())["refusals"]) == 20
-
-
-def test_a_client_of_a_known_robot_is_answered(served_policy, serving, observe) -> None:
-    served = served_policy()
-    own = observe(0, state=np.arange(12.0), state_time=None, sensor=None, sensor_time=None)
-    cameras = ("cam_high", "cam_left_wrist", "cam_right_wrist")
-    views = [name for name in own if name.startswith("images/")]
-    images = {c: np.moveaxis(own[v], -1, 0) for c, v in zip(cameras, views, strict=True)}
-    with client_of(serving(served, transform="aloha")) as client:
-        assert client.metadata["transform"] == "aloha"
-        answer = client.infer({"images": images, "state": own["state"], "time": own["time"]})
-    np.testing.assert_array_equal(answer["actions"], served.session().infer(own)["actions"])
+    assert server.lines[1].endswith("episode: go on") and "2 answers in " in server.lines[4]
+    assert not any("turned away" in line for line in server.lines)
 
 
 def test_a_message_beyond_the_bound_is_not_read(served_policy, serving, observe) -> None:
     server = serving(served_policy(), max_message_mb=1)
-    with opened(server) as bare:
-        bare.send(b"\0" * (2**20 + 1))
-        assert closing_code(bare) == 1009
-    with client_of(server) as good:
-        assert good.infer(observe(0))["actions"].shape == (4, 7)
+    large = {"images/View1": np.zeros((600, 600, 3), np.uint8)}
+    with (
+        client_of(server) as client,
+        pytest.raises(ConnectionError, match=r"serve\.max_message_mb"),
+    ):
+        client.infer(observe(0, **large))
 
 
 def test_a_bug_is_said_in_one_line_and_told_in_full_here(served_policy, serving, observe, capfd):
@@ -261,42 +207,14 @@ def test_the_token_is_asked_for(served_policy, serving, observe) -> None:
     assert get(server, "/status.json", Authorization="Api-Key s3cret")[0] == 200
 
 
-def test_pages_of_other_places_are_refused(served_policy, serving) -> None:
+def test_web_pages_are_refused(served_policy, serving) -> None:
     server = serving(served_policy())
-    for headers in (
-        {"Origin": "https://example.org"},
-        {"Origin": "null"},
-        {"Origin": f"http://{server.address}"},
-        {"Host": "example.org:8000"},  # a name made to mean this machine
-    ):
+    for origin in ("null", f"http://{server.address}"):
         for path in ("/", "/status.json"):
-            assert get(server, path, **headers)[0] == 403, headers
-    _, body, _ = get(server, "/status.json", Host="robot.lab:8000")
-    assert "robot.lab:8000" in body and "serve.token_file" in body
+            assert get(server, path, Origin=origin)[0] == 403
     with pytest.raises(InvalidStatus, match="403"), opened(server, origin="https://example.org"):
         pass
-    assert [get(server, path)[0] for path in ("/", "/elsewhere")] == [404, 404]
-
-
-@pytest.mark.parametrize(
-    ("path", "headers", "said"),
-    [
-        ("/", ["Host: [::1"], "Invalid IPv6 URL"),
-        ("//[", ["Host: localhost"], "Invalid IPv6 URL"),
-        ("/", ["Host: localhost", "Host: localhost"], "expected the header 'Host' once"),
-        ("/status.json", ["Authorization: a", "Authorization: b"], "'Authorization' once"),
-    ],
-)
-def test_a_request_that_no_server_can_read_is_refused_with_a_reason(
-    served_policy, serving, path, headers, said, capfd
-):
-    server = serving(served_policy(), token="s3cret")
-    host, _, port = server.address.rpartition(":")
-    with socket.create_connection((host, int(port)), 20) as raw, raw.makefile("rb") as answer:
-        raw.sendall("\r\n".join([f"GET {path} HTTP/1.1", *headers, "", ""]).encode())
-        text = answer.read().decode()
-    assert text.startswith("HTTP/1.1 400 ") and said in text
-    assert "Traceback" not in capfd.readouterr().err
+    assert get(server, "/elsewhere")[0] == 404
 
 
 def test_stopping_answers_what_is_under_way_and_takes_no_more(served_policy, serving, observe):
@@ -361,6 +279,6 @@ def test_a_robot_counts_until_its_observation_is_answered_though_it_has_left(
     with opened(server) as bare:
         bare.send(wire.pack(observe(0)))
         assert blocked.looking.wait(60)
-    with pytest.raises(ConnectionError, match=r"busy: 1 robots.*serve.max_connections"):
+    with pytest.raises(ConnectionError, match=r"1 robots.*serve.max_connections"):
         client_of(server)
     blocked.go.set()

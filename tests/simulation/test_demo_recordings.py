@@ -156,65 +156,41 @@ def quick_sets(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     return written
 
 
-def test_finished_sets_are_kept_and_other_params_replace_the_demos_own(quick_sets, tmp_path):
-    write_demo_recordings(tmp_path, 2, 0)
-    write_demo_recordings(tmp_path, 2, 0)
-    assert sorted(quick_sets) == sorted(SETS)
-    (tmp_path / "mine").mkdir()
-    write_demo_recordings(tmp_path, 2, 1)
-    assert sorted(quick_sets) == sorted([*SETS, *SETS]) and (tmp_path / "mine").is_dir()
-    (tmp_path / "raw/mine").touch()  # an episode of the user's
-    with pytest.raises(ConfigError, match=f"{tmp_path / 'raw'}: expected the files that the demo"):
-        write_demo_recordings(tmp_path, 2, 2)
-    assert (tmp_path / "raw/mine").exists() and (tmp_path / "new/content").exists()
+def test_a_finished_demo_is_kept_and_other_params_replace_it_unless_files_were_added(
+    quick_sets, tmp_path
+):
+    root = tmp_path / "demo"
+    for seed in (0, 0, 1):
+        write_demo_recordings(root, 2, seed)
+    assert sorted(quick_sets) == sorted([*SETS, *SETS])
+    (root / "raw/mine").touch()  # an episode of the user's
+    write_demo_recordings(root, 2, 1)
+    with pytest.raises(ConfigError, match=f"{root}: expected the files that the demo wrote"):
+        write_demo_recordings(root, 2, 2)
+    assert (root / "raw/mine").exists() and (root / "new/content").exists()
 
 
-def test_a_stopped_run_goes_on_with_the_unfinished_sets(quick_sets, tmp_path, monkeypatch) -> None:
-    whole = dict(demo_recordings._SETS)
+def test_a_stopped_run_leaves_nothing_and_a_full_disk_says_so(quick_sets, tmp_path, monkeypatch):
+    for error, raised in (
+        (KeyboardInterrupt(), KeyboardInterrupt),
+        (OSError(errno.ENOSPC, "No space left on device"), DiskFull),
+    ):
 
-    def stopped(folder: Path, episodes: demo_recordings.Episodes) -> None:
-        folder.mkdir()
-        (folder / "half").touch()
-        raise KeyboardInterrupt
+        def stopped(folder: Path, episodes: object, error: BaseException = error) -> None:
+            folder.mkdir()
+            raise error
 
-    monkeypatch.setitem(demo_recordings._SETS, "old", stopped)
-    with pytest.raises(KeyboardInterrupt):
-        write_demo_recordings(tmp_path, 2, 0)
-    assert not (tmp_path / "old").exists()
-    monkeypatch.setattr(demo_recordings, "_SETS", whole)
-    write_demo_recordings(tmp_path, 2, 0)
-    assert {*quick_sets} == {*SETS}
-    assert sorted(path.name for path in tmp_path.iterdir()) == sorted([*SETS, MARKER])
-    assert not (tmp_path / "old" / "half").exists()
+        monkeypatch.setitem(demo_recordings._SETS, "old", stopped)
+        with pytest.raises(raised):
+            write_demo_recordings(tmp_path / "demo", 2, 0)
+        assert not [*tmp_path.iterdir()]
 
 
 def test_a_folder_that_the_demo_did_not_write_is_left_alone(quick_sets, tmp_path) -> None:
     (tmp_path / "file").touch()
-    with pytest.raises(ConfigError, match=r"did not write it.*demo\.recordings"):
-        write_demo_recordings(tmp_path / "file", 2, 0)
-    with pytest.raises(ConfigError, match=r"did not write it.*demo\.recordings"):
-        write_demo_recordings(tmp_path, 2, 0)
-    (tmp_path / "file").unlink()
-    write_demo_recordings(tmp_path, 2, 0)
-    marker = json.loads((tmp_path / MARKER).read_text(encoding="utf-8"))
-    marker["sets"].remove("new")
-    (tmp_path / MARKER).write_text(json.dumps(marker), encoding="utf-8")
-    with pytest.raises(ConfigError, match=r"does not list new"):
-        write_demo_recordings(tmp_path, 2, 5)
-    assert (tmp_path / "raw" / "content").is_file()
-
-
-@pytest.mark.parametrize("text", ["{", '{"sets": ["../raw"]}'])
-def test_a_broken_marker_is_named(quick_sets, tmp_path: Path, text: str) -> None:
-    (tmp_path / MARKER).write_text(text, encoding="utf-8")
+    for place in (tmp_path / "file", tmp_path):
+        with pytest.raises(ConfigError, match="expected nothing there or a demo"):
+            write_demo_recordings(place, 2, 0)
+    (tmp_path / "file").rename(tmp_path / MARKER)
     with pytest.raises(ConfigError, match=rf"{MARKER}: .* Remove the folder"):
-        write_demo_recordings(tmp_path, 2, 0)
-
-
-def test_a_full_disk_says_so(quick_sets, tmp_path, monkeypatch) -> None:
-    def full(folder: Path, episodes: demo_recordings.Episodes) -> None:
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    monkeypatch.setitem(demo_recordings._SETS, "lerobot", full)
-    with pytest.raises(DiskFull, match="no space left"):
         write_demo_recordings(tmp_path, 2, 0)

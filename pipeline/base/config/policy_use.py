@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal
 
-from pydantic import AfterValidator, Field, model_validator
+from pydantic import AfterValidator, Field
 
 from pipeline.base.config.section import Output, Place, Section, Seed
 
@@ -97,8 +97,6 @@ class RolloutParams(Section):
     """Simulated time in ms of one pass of the model; its features are older by this. The head takes
     no time. For several, such as `[0, 300, 600]`, the page plots success against latency;
     everything else uses the first."""
-    head: Place | None = None
-    """Folder of `stages.export`; its head.onnx replaces the checkpoint's own head."""
     ablations: tuple[RolloutAblation, ...] = ("sensor off", "features off")
     """Also run the policy with one stream disturbed. off: every value is its training mean. frozen:
     the stream stays as it was first, as if it were new. Streams that the policy does not use are
@@ -111,14 +109,6 @@ class RolloutParams(Section):
     """auto, cpu, cuda or cuda:N."""
     output: Output = Path("reports/rollout")
     """Folder of metrics, table and page."""
-
-    @model_validator(mode="after")
-    def _one_answers(self) -> "RolloutParams":
-        if self.head is not None and self.server is not None:
-            raise ValueError("head and server: either an exported head answers or a server does")
-        if self.head is not None and self.chunking == "rtc":
-            raise ValueError("head: an exported head cannot be guided: set chunking to temporal")
-        return self
 
 
 class ServeParams(Section):
@@ -141,21 +131,11 @@ class ServeParams(Section):
     seed: Seed = 0
     """Seed of a policy's draws for a robot that sends no seed."""
     max_connections: int = Field(default=8, ge=1, le=10_000)
-    """Most robots at a time."""
-    max_waiting: int = Field(default=8, ge=1, le=10_000)
-    """Most observations that are being answered or wait; one more is refused as busy."""
+    """Most robots at a time; each has one observation that is being answered or waits."""
     max_message_mb: int = Field(default=64, ge=1, le=1024)
     """Largest size of one observation, in MiB."""
     idle_s: float = Field(default=600.0, gt=0, le=1e6)
     """Seconds after which a connection without a complete message is closed."""
-    transform: Literal["aloha", "droid", "libero"] | None = None
-    """Take observations by the names that openpi's clients of this robot give. Their images are
-    the policy's views in this order. aloha: `images/cam_high`, `cam_left_wrist`,
-    `cam_right_wrist`, `cam_low`; `state`. droid: `observation/exterior_image_1_left`,
-    `wrist_image_left`; the state is `joint_position` and `gripper_position`. libero:
-    `observation/image`, `wrist_image`; `observation/state`."""
-    log: Literal["text", "json"] = "text"
-    """How the line of each connection, episode, slow answer, warning and refusal is written."""
 
 
 class DriveParams(Section):
@@ -219,8 +199,6 @@ class ExportParams(Section):
     """Folder of the files and their receipt."""
     formats: tuple[ExportFormat, ...] = Field(default=("onnx", "torch"), min_length=1)
     """onnx: `head.onnx`, for ONNX Runtime. torch: `head.pt2`, for `torch.export.load`."""
-    opset: int = Field(default=20, ge=18, le=100)
-    """ONNX operator set version."""
 
 
 class CompareParams(Section):
