@@ -16,9 +16,9 @@ from pipeline.base.observation import Observation
 from pipeline.evaluate.baselines import Baselines
 from pipeline.evaluate.figures import Figure, times
 from pipeline.policy.checkpoint import PolicyCheckpoint
-from pipeline.policy.observation import VALIDITY, stream_of
+from pipeline.policy.observation import stream_of
 from pipeline.policy.policy import Policy
-from pipeline.store import Batch, FeatureStore, episode_name
+from pipeline.store import Batch, FeatureStore
 from pipeline.train.batches import NO_LAGS, BatchIndices, Lags, Prefetch, Ticks, Windows, evenly
 from pipeline.train.predictions import FeedMaker, predict
 from pipeline.train.scores import Comparison, action_space, compare
@@ -45,7 +45,7 @@ class Ablated:
 
     stream: str
     how: str
-    """`zeroed`, `missing`, `shuffled` or `delayed 50 ms`."""
+    """`zeroed`, `shuffled` or `delayed 50 ms`."""
     comparison: Comparison
     intact: Comparison
     """The policy with all streams, on the same ticks: those whose episode has this stream."""
@@ -111,7 +111,6 @@ def evaluate_ablation(
             ways.append((stream, how, having, feed_maker(store, windows, device, alter=alter)))
         for how, lags in delays(store, stream).items():
             ways.append((stream, how, having, feed_maker(store, windows, device, lags)))
-        notes += _emptied(windows, stream)
     space = action_space(store, checkpoint.normalization)
     intact: dict[str, Comparison] = {}
     ablated: list[Ablated] = []
@@ -151,11 +150,8 @@ def _alterations(
     checkpoint: PolicyCheckpoint, store: FeatureStore, ticks: Ticks, stream: str
 ) -> tuple[dict[str, Alter], list[str]]:
     """Ways to alter a stream at these ticks, and notes for the reader of the results."""
-    ways, notes = {"zeroed": zeroed(stream, checkpoint.typical(stream))}, []
-    if _knows_missing(checkpoint, store, stream):
-        ways["missing"] = missing(stream)
-    else:
-        notes.append(f"{stream} missing: not judged, as training never showed it (drop_{stream} 0)")
+    ways: dict[str, Alter] = {"zeroed": zeroed(stream, checkpoint.typical(stream))}
+    notes: list[str] = []
     donors = donors_of(store, ticks, stream)
     if donors is None:
         notes.append(f"{stream} shuffled: not judged, it takes two test episodes with it")
@@ -165,19 +161,6 @@ def _alterations(
     if stream == "features":
         notes.append(f"features delayed: by whole VL rows, of {_row_ms(store):.0f} ms each")
     return ways, notes
-
-
-def _knows_missing(checkpoint: PolicyCheckpoint, store: FeatureStore, stream: str) -> bool:
-    """Whether the policy was also trained on samples without this stream."""
-    if getattr(checkpoint.params, f"drop_{stream}") > 0:
-        return True
-    if stream == "features":
-        return False
-    readings = np.diff(store.array(f"episode/{stream}_start"))
-    return any(
-        not readings[episode.index] and episode_name(episode) in checkpoint.split["train"]
-        for episode in store.episodes
-    )
 
 
 def zeroed(stream: str, mean: NDArray[np.floating]) -> Alter:
@@ -193,12 +176,6 @@ def zeroed(stream: str, mean: NDArray[np.floating]) -> Alter:
         return replace(batch, **{stream: level.expand(*values.shape[:-1], level.shape[-1])})
 
     return alter
-
-
-def missing(stream: str) -> Alter:
-    """Every reading of the stream is invalid: its encoder gives the embedding for a missing one."""
-    valid = VALIDITY[stream]
-    return lambda indices, batch: replace(batch, **{valid: torch.zeros_like(getattr(batch, valid))})
 
 
 def exchanged(
@@ -253,17 +230,6 @@ def delays(store: FeatureStore, stream: str) -> dict[str, Lags]:
     row_ms = _row_ms(store)
     rows = sorted({max(1, round(ms / row_ms)) for ms in DELAYS_MS})
     return {f"delayed {count * row_ms:.0f} ms": Lags(features=count) for count in rows}
-
-
-def _emptied(windows: Windows, stream: str) -> list[str]:
-    """Notes on delays that are longer than a stream's window in seconds."""
-    oldest_s = vars(windows).get(f"{stream}_window_s") or np.inf
-    return [
-        f"{stream} delayed {ms} ms: older than its window of {1000 * oldest_s:.0f} ms, so the "
-        "policy sees nothing of it"
-        for ms in DELAYS_MS
-        if ms / 1000 > oldest_s
-    ]
 
 
 def _row_ms(store: FeatureStore) -> float:

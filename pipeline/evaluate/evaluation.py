@@ -19,7 +19,6 @@ from pipeline.data.contact import contact_spans, force_columns
 from pipeline.evaluate.ablation import AblationStudy, evaluate_ablation
 from pipeline.evaluate.baselines import Baselines
 from pipeline.evaluate.figures import Figure, mean_over_ticks
-from pipeline.evaluate.sources import TrainingCurves, read_curves
 from pipeline.policy.checkpoint import PolicyCheckpoint
 from pipeline.policy.policy import Trainable
 from pipeline.store import Episode, FeatureStore
@@ -58,7 +57,6 @@ class Evaluation:
     study: AblationStudy | None
     judged: Mapping[str, Any]
     """What `judged_document` returns."""
-    curves: TrainingCurves
     recordings: Path
     """The root of the relative paths of the store's recordings."""
 
@@ -122,7 +120,6 @@ def evaluate_checkpoint(
         energy=mean_over_ticks(energy, groups) if len(energy) else None,
         study=study,
         judged=judged,
-        curves=read_curves(checkpoint),
         recordings=recordings,
     )
 

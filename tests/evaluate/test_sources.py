@@ -1,4 +1,4 @@
-"""Curves of a training and frames of recordings are those of the policy and store, or none."""
+"""Frames of recordings are those of the store, or none."""
 
 import shutil
 from collections.abc import Sequence
@@ -8,17 +8,15 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from pipeline.base.config import Source, TrainHeadParams
+from pipeline.base.config import Source
 from pipeline.base.digests import file_digest
 from pipeline.data import Recording, content_digest, open_recordings
 from pipeline.data.timeline import Timeline, build_timeline
 from pipeline.evaluate.sources import (
     EpisodeFrames,
-    TrainingCurves,
     read_episode_frames,
     shown_ticks,
 )
-from pipeline.evaluate.sources import read_curves as curves_of
 from pipeline.simulation.insertion_formats import (
     ABUTTING,
     write_lerobot,
@@ -28,53 +26,6 @@ from pipeline.simulation.insertion_formats import (
 )
 from pipeline.simulation.recorder import simulate_episode
 from pipeline.store import FeatureStore
-
-
-def read_curves(logs: Path, step: int = 20, **metrics: float) -> TrainingCurves:
-    """Of a checkpoint of that step, with this error where one is given."""
-    named = {name.replace("_", "/"): value for name, value in metrics.items()}
-    checkpoint = SimpleNamespace(params=TrainHeadParams(logs=logs), step=step, metrics=named)
-    return curves_of(checkpoint)  # type: ignore[arg-type]
-
-
-def written(logs: Path, name: str, text: str) -> None:
-    """One curve as dvclive writes it."""
-    file = logs / f"plots/metrics/{name}.tsv"
-    file.parent.mkdir(parents=True, exist_ok=True)
-    file.write_text(text)
-
-
-def test_every_curve_is_read_under_its_name(tmp_path: Path) -> None:
-    written(tmp_path, "train/loss", "step\tloss\n10\t0.5\n20\t0.25\n")
-    written(tmp_path, "val/error", "step\terror\n20\t9e-1\n")
-    written(tmp_path, "lr", "step\tlr\n")
-    found = read_curves(tmp_path, val_error=0.9)
-    points = {n: (c.step.tolist(), c.value.tolist()) for n, c in found.curves.items()}
-    assert points == {"train/loss": ([10, 20], [0.5, 0.25]), "val/error": ([20], [0.9])}
-    assert found.absence == ""
-
-
-def test_logs_that_are_gone_empty_or_torn_are_said(tmp_path: Path) -> None:
-    found = read_curves(tmp_path / "logs")
-    assert found.curves == {} and str(tmp_path / "logs") in found.absence
-    for content in ("step\tloss\n", "step\tloss\n10\n", "step\tloss\n10\tmuch\n"):
-        written(tmp_path, "train/loss", content)
-        found = read_curves(tmp_path)
-        assert found.curves == {} and str(tmp_path) in found.absence
-
-
-def test_curves_of_another_training_are_not_shown(tmp_path: Path) -> None:
-    written(tmp_path, "val/error", "step\terror\n10\t0.5\n20\t0.25\n")
-    assert read_curves(tmp_path, 10, val_error=0.5).curves
-    assert read_curves(tmp_path, 10).curves, "a last checkpoint has no error of its own"
-    for other in (
-        read_curves(tmp_path, 30),
-        read_curves(tmp_path, 15, val_error=0.5),
-        read_curves(tmp_path, 20, val_error=0.5),
-    ):
-        assert other.curves == {}
-        assert "are of another training" in other.absence
-
 
 FORMATS = ("raw", "new", "old", "lerobot")
 REUSE = 3
@@ -157,13 +108,6 @@ def test_a_recording_that_changed_or_is_gone_shows_nothing(root: Path, format: s
     found = one.frames([0], root)
     assert found.frames == {}
     assert f"no recording at {root / one.episode.path} any more" in found.absence
-
-
-def test_another_frame_under_the_same_name_is_not_shown(root: Path) -> None:
-    one = stored(root, "raw")
-    first, second, *_ = [file for file in one.recording.files() if file.suffix == ".jpg"]
-    shutil.copyfile(second, first)
-    assert one.frames([0], root).frames == {}
 
 
 @pytest.mark.parametrize(

@@ -21,7 +21,6 @@ from matplotlib.colors import Colormap
 from matplotlib.figure import Figure
 from matplotlib.gridspec import GridSpec
 from matplotlib.image import AxesImage
-from matplotlib.ticker import NullFormatter, StrMethodFormatter
 from numpy.typing import NDArray
 from PIL import Image
 
@@ -145,13 +144,6 @@ def draw_strip(
             axis.images[0].set_gid(f"frame-{row}-{column}")
             axis.set_ylabel("" if column else view)
             axis.set_title("" if row else f"{times_s[column]:.1f} s")
-
-
-def logarithmic(axis: Axes) -> None:
-    """Make the y axis logarithmic, with plain numbers: matplotlib's own labels are TeX."""
-    axis.set_yscale("log")
-    axis.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
-    axis.yaxis.set_minor_formatter(NullFormatter())
 
 
 def finish(figure: Figure, axis: Axes, columns: int, title: str | None = None) -> None:
