@@ -19,8 +19,6 @@ from stages.command import Shorthand, run
 
 if TYPE_CHECKING:
     from pipeline.base.config import Params
-    from pipeline.base.text import Table
-    from pipeline.store.archive import Manifest
 
 SECTIONS = ("archive",)
 SHORTHANDS = (Shorthand("--restore", "archive.restore", "make the store from its archive"),)
@@ -42,26 +40,10 @@ def main(params: "Params") -> None:
         return
     seconds = time.perf_counter() - begun
     raw, stored = manifest.raw_bytes / 1e6, manifest.stored_bytes / 1e6
-    print(*_table(manifest).text(), sep="\n")
     print(
         f"{output}: {raw:.1f} MB in {stored:.1f} MB ({raw / stored:.2f} : 1), {seconds:.1f} s "
         f"({raw / seconds:.0f} MB/s)"
     )
-
-
-def _table(manifest: "Manifest") -> "Table":
-    """Each array: size, how much smaller it became, codec."""
-    from pipeline.base.text import Table
-
-    sizes = [
-        (name, array.raw_bytes, sum(array.shard_bytes), array.codec)
-        for name, array in manifest.arrays.items()
-    ]
-    rows = [
-        (name, raw / 1e6, raw / stored if stored else None, codec)  # zeros have no shard
-        for name, raw, stored, codec in sizes
-    ]
-    return Table(("array", "MB", "ratio", "codec"), rows)
 
 
 def _places(params: "Params") -> tuple[Path, Path]:
@@ -74,11 +56,6 @@ def _places(params: "Params") -> tuple[Path, Path]:
         raise ConfigError(
             f"archive.output: expected a name that ends in .zarr, found {output}. "
             f"Set archive.output={output.with_name(output.name + '.zarr')}"
-        )
-    if output.resolve().is_relative_to(store.resolve()):
-        raise ConfigError(
-            f"archive.output: {output} is the store {store} itself or lies in it. Name another "
-            "place, or set it to null for one beside the store."
         )
     return store, output
 

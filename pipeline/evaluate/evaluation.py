@@ -57,8 +57,6 @@ class Evaluation:
     study: AblationStudy | None
     judged: Mapping[str, Any]
     """What `judged_document` returns."""
-    recordings: Path
-    """The root of the relative paths of the store's recordings."""
 
 
 def evaluate_checkpoint(
@@ -67,7 +65,6 @@ def evaluate_checkpoint(
     store: FeatureStore,
     wanted: EvaluateParams,
     device: torch.device,
-    recordings: Path,
     say: Callable[[str], None],
 ) -> Evaluation:
     """Evaluate the policy of the checkpoint in `folder` on its test ticks in a store that it fits.
@@ -120,7 +117,6 @@ def evaluate_checkpoint(
         energy=mean_over_ticks(energy, groups) if len(energy) else None,
         study=study,
         judged=judged,
-        recordings=recordings,
     )
 
 

@@ -1,6 +1,6 @@
 """The page of an evaluation: how well a policy does, where it errs, and what it was made of."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -17,20 +17,17 @@ from pipeline.evaluate.baselines import METHODS
 from pipeline.evaluate.evaluation import Evaluation, trained_on_too
 from pipeline.evaluate.figures import Figure as Merit
 from pipeline.evaluate.figures import best_baseline, error, rivalry, with_unit
-from pipeline.evaluate.sources import read_episode_frames, shown_ticks
 from pipeline.look.page.blocks import Block, Outline, Picture, Report, Section, Text, next_steps
 from pipeline.look.page.style import (
     INK,
     PALETTE,
-    canvas,
-    draw_strip,
     finish,
     panels,
     shorten_middle,
 )
 from pipeline.look.page.writing import sentence
 from pipeline.store import Episode, FeatureStore, episode_name
-from pipeline.train.batches import Ticks
+from pipeline.train.batches import Ticks, evenly
 from pipeline.train.predictions import Predictions
 from pipeline.train.scores import ActionGroup, Comparison
 
@@ -47,7 +44,6 @@ STYLES: dict[str, dict[str, Any]] = {
     "linear_fit": {"color": "#D55E00", "marker": "v", "ls": "-."},
     "nearest_neighbour": {"color": "#56B4E9", "marker": "P", "ls": "--"},
 }
-_CHUNKS_WIDTH = 11.0
 _CHUNK = PALETTE[5]
 """Colour of whole chunks."""
 _POLICY = STYLES["policy"]["color"]
@@ -62,7 +58,7 @@ _DOING = {
 }
 """The baselines, as a sentence has them."""
 _INSTANTS = 5
-"""Ticks of an episode at which its frames are shown."""
+"""Ticks of an episode at which whole chunks are shown."""
 _EPISODES = 40
 """The most rows of the table of episodes."""
 _PAIRED = (
@@ -72,7 +68,7 @@ _PAIRED = (
 
 
 def evaluation_report(evaluation: Evaluation, rollout: str = "") -> Report:
-    """The page of an evaluation, with frames of its recordings if these are still there.
+    """The page of an evaluation.
 
     `rollout` is the path from this page to the page of the rollouts, if there is one. The same
     evaluation gives the same page: it names neither the time nor its own folder.
@@ -97,7 +93,7 @@ def evaluation_report(evaluation: Evaluation, rollout: str = "") -> Report:
             Section("Error of the whole chunk", _chunk(evaluation)),
             *([Section("Phases", _phases(comparison))] if tables.by_phase(comparison) else []),
             Section("Dimensions and steps ahead", _dimensions(evaluation)),
-            Section("Episodes", [*_episodes(evaluation), *_worst(evaluation)]),
+            Section("Episodes", [_episodes(evaluation), _worst(evaluation)]),
             Section("Which streams are used", _modalities(evaluation.study)),
             Section("What was judged", _documents(evaluation)),
             next_steps(*_advice(evaluation, rollout)),
@@ -256,7 +252,7 @@ def _draw_band(axis: Axes, comparison: Comparison, method: str, group: ActionGro
     axis.fill_between(steps, low, high, color=STYLES[method]["color"], alpha=0.18, lw=0)
 
 
-def _episodes(evaluation: Evaluation) -> list[Block]:
+def _episodes(evaluation: Evaluation) -> Table:
     """The test episodes, the worst first."""
     comparison, store = evaluation.comparison, evaluation.store
     best = best_baseline(comparison)
@@ -271,27 +267,21 @@ def _episodes(evaluation: Evaluation) -> list[Block]:
     if len(rows) < len(comparison.episodes):
         caption += f"; the worst {len(rows)} of {len(comparison.episodes)}"
     heads = ["episode", "test ticks", "policy", tables.HEADINGS[best], "policy / baseline"]
-    return [Table(heads, rows, f"{caption}.")]
+    return Table(heads, rows, f"{caption}.")
 
 
-def _worst(evaluation: Evaluation) -> Iterator[Block]:
-    """The worst episode in detail, with frames if its recording is still there."""
+def _worst(evaluation: Evaluation) -> Picture:
+    """The worst episode in detail."""
     comparison, predictions, store = evaluation.comparison, evaluation.predictions, evaluation.store
     index = comparison.episodes[comparison.ranked()[-1]]
     episode = store.episodes[index]
-    ticks = shown_ticks(store, _whole(predictions, index), _INSTANTS)
-    rows = store.array("tick/vl_row")[ticks]
-    seen = read_episode_frames(store, episode, rows.tolist(), evaluation.recordings)
-    if seen.absence:
-        yield Text(seen.absence)
-    above = "Above, the frames that the features at the dotted ticks were computed from. "
+    ticks = evenly(_whole(predictions, index), _INSTANTS)
     caption = (
-        f"The worst episode, {episode_name(episode)}. Instruction: {episode.instruction}. "
-        f"{above if seen.frames else ''}Recorded action, the policy's next action at every tick, "
-        "and its whole chunks at the dotted ticks."
+        f"The worst episode, {episode_name(episode)}. Instruction: {episode.instruction}. Recorded "
+        "action, the policy's next action at every tick, and its whole chunks at the dotted ticks."
     )
-    shown = comparison, predictions, store, episode, ticks, seen.frames
-    yield Picture("episode_worst", caption, partial(draw_chunks, *shown))
+    shown = comparison, predictions, store, episode, ticks
+    return Picture("episode_worst", caption, partial(draw_chunks, *shown))
 
 
 def _whole(predictions: Predictions, index: int) -> Ticks:
@@ -307,31 +297,20 @@ def draw_chunks(
     store: FeatureStore,
     episode: Episode,
     instants: NDArray[np.int64],
-    frames: Mapping[str, Sequence[NDArray[np.uint8]]],
 ) -> Figure:
-    """Frames at `instants` above, and below them recorded and predicted actions over time.
+    """Recorded and predicted actions over time: the next at every tick, whole chunks at `instants`.
 
-    `instants` are test ticks of the episode, store-global; `frames` has one of each view for each
-    instant, or no view at all. The picture shows the next action at every tick, and the whole chunk
-    at the instants.
+    `instants` are test ticks of the episode, store-global.
     """
     time_s = store.array("tick/time")[episode.ticks.start : episode.ticks.stop]
     time_s = time_s - time_s[0]
     here = predictions.episodes == episode.index
     at = time_s[predictions.ticks[here] - episode.ticks.start]
     shown = comparison.varying()
-    width = _CHUNKS_WIDTH / max(3, len(instants))
-    shapes = [[image.shape for image in images] for images in frames.values()]
-    heights = [width * max(shape[0] / shape[1] for shape in view) for view in shapes]
-    heights += [1.15] * len(shown)
-    figure = canvas(_CHUNKS_WIDTH, sum(heights) + 1.7)
-    grid = figure.add_gridspec(len(heights), len(instants), height_ratios=heights)
-    draw_strip(figure, grid, frames, time_s[instants - episode.ticks.start].tolist())
-    axes: list[Axes] = []
+    height = 1.15 * len(shown) + 1.7
+    figure, axes = panels(11.0, height, len(shown), 1, squeeze=False, sharex=True)
     places = np.flatnonzero(np.isin(predictions.ticks, instants))
-    for row, dimension in enumerate(shown, len(frames)):
-        axis = figure.add_subplot(grid[row, :], sharex=axes[0] if axes else None)
-        axes.append(axis)
+    for axis, dimension in zip(axes[:, 0], shown, strict=True):
         recorded, predicted = predictions.recorded[here, 0], predictions.predicted[here, 0]
         axis.plot(at, recorded[:, dimension], color=INK, lw=2.2, label="recorded")
         axis.plot(at, predicted[:, dimension], color=_POLICY, lw=1.6, label="policy, next action")
@@ -344,12 +323,11 @@ def draw_chunks(
             axis.plot(ahead, chunk, color=_CHUNK, lw=2, zorder=6, label=label)
             axis.plot(ahead[0], chunk[0], color=_CHUNK, marker="o", ms=5, zorder=6)
             label = ""
-        axis.label_outer()
-    axes[-1].set_xlabel("time since the episode began [s]")
+    axes[-1, 0].set_xlabel("time since the episode began [s]")
     figure.align_ylabels(axes)
     overall = comparison.overall_by_episode("policy")[comparison.episodes.index(episode.index)]
     name = shorten_middle(episode_name(episode), 14, 28)
-    finish(figure, axes[0], 3, f"{name}: overall error {overall:.3f} [training std]")
+    finish(figure, axes[0, 0], 3, f"{name}: overall error {overall:.3f} [training std]")
     return figure
 
 

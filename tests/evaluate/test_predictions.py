@@ -87,8 +87,8 @@ def test_the_policy_sees_what_the_feed_hands_out(store: FeatureStore) -> None:
 
     calls = []
 
-    def negated(draw, batch):
-        calls.append(len(draw.ticks))
+    def negated(batch):
+        calls.append(len(batch))
         return replace(batch, sensor=-batch.sensor)
 
     altered = run(StandIn(), store, 1, feed=feed_maker(store, WINDOWS, device, NO_LAGS, negated))

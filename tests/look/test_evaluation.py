@@ -4,7 +4,6 @@ import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -15,9 +14,7 @@ from pipeline.evaluate.ablation import evaluate_ablation
 from pipeline.evaluate.baselines import Baselines
 from pipeline.evaluate.evaluation import Evaluation, judged_document
 from pipeline.evaluate.figures import Figure, Rivalry, rivalry
-from pipeline.evaluate.sources import EpisodeFrames
 from pipeline.evaluate.tables import ablation_table, error_table
-from pipeline.look import evaluation as evaluation_page
 from pipeline.look.evaluation import evaluation_report
 from pipeline.look.page.blocks import Outline, Picture, Report, Section, Text
 from pipeline.look.page.writing import PAGE, write_report
@@ -89,7 +86,6 @@ def judgement(
         energy=None,
         study=evaluate_ablation(checkpoint, policy, store, ticks, baselines, 64),
         judged=judged_document(checkpoint, policy, store, EvaluateParams()),
-        recordings=Path("data/nowhere"),
     )
 
 
@@ -184,26 +180,14 @@ def test_the_page_is_sound(judgement, tmp_path, assert_page_is_sound):
     assert_page_is_sound(tmp_path / PAGE)
 
 
-@pytest.mark.parametrize("there", [True, False])
-def test_the_worst_episode_is_shown_with_frames_and_without(judgement, monkeypatch, there):
+def test_the_worst_episode_is_shown(judgement):
     comparison = judgement.comparison
     worst = judgement.store.episodes[comparison.episodes[comparison.ranked()[-1]]]
-
-    def shades(store: FeatureStore, episode: Any, rows: list[int], *rest: Any) -> EpisodeFrames:
-        assert episode is worst and all(row in episode.vl_rows for row in rows) and len(rows) == 5
-        return EpisodeFrames({"View1": [np.full((12, 16, 3), row, np.uint8) for row in rows]})
-
-    if there:
-        monkeypatch.setattr(evaluation_page, "read_episode_frames", shades)
-    report = evaluation_report(judgement)
-    pictures = {picture.name: picture for picture in report.blocks(Picture)}
+    pictures = {picture.name: picture for picture in evaluation_report(judgement).blocks(Picture)}
     assert pictures.keys() == {"methods", "horizon", "episode_worst"}
     shown = pictures["episode_worst"]
-    assert ("Above, the frames that the features" in shown.caption) == there
-    assert len(shown.draw().axes) == len(comparison.varying()) + 5 * there
-    said = [text.words for text in report.blocks(Text) if "No frames:" in text.words]
-    gone = f"No frames: there is no recording at data/nowhere/{worst.path} any more."
-    assert said == ([] if there else [gone])
+    assert episode_name(worst) in shown.caption
+    assert len(shown.draw().axes) == len(comparison.varying())
 
 
 def test_streams_that_nobody_asked_for_are_said(judgement: Evaluation) -> None:

@@ -55,15 +55,11 @@ def evaluated(
 
 
 def pictures(comparison: Comparison, predictions: Predictions, store: Any) -> dict[str, Any]:
-    """Each picture of an evaluation by its file's name; frames of two views for one episode."""
-    rng = np.random.default_rng(0)
-    frames = {name: rng.integers(0, 255, (2, 12, 16, 3), np.uint8) for name in ("A", "B")}
+    """Each picture of an evaluation by its file's name."""
     instants = predictions.ticks[predictions.episodes == comparison.episodes[0]][[0, 6]]
 
     def chunks() -> Figure:
-        return plots.draw_chunks(
-            comparison, predictions, store, store.episodes[0], instants, frames
-        )
+        return plots.draw_chunks(comparison, predictions, store, store.episodes[0], instants)
 
     return {
         "horizon.png": lambda: plots.draw_horizon(comparison, store.action_hz),
@@ -81,17 +77,15 @@ def test_every_picture_is_written(tmp_path, episodes, dimensions, constant, hori
     assert len(files) == 3 and all(file.stat().st_size > 5000 for file in files)
 
 
-def test_whole_chunks_are_drawn_at_their_instants_with_and_without_frames() -> None:
+def test_whole_chunks_are_drawn_at_their_instants() -> None:
     comparison, predictions, store = evaluated(2)
     figure = pictures(comparison, predictions, store)["chunks.png"]()
-    courses = figure.axes[4:]  # below two views of two instants
-    assert len(courses) == 4
-    for axis, dimension in zip(courses, range(4), strict=True):
+    for axis, dimension in zip(figure.axes, range(4), strict=True):
         whole = [line for line in axis.lines if len(line.get_xdata()) == 3]
         assert [line.get_xdata()[0] for line in whole] == pytest.approx([0.0, 0.6])
         np.testing.assert_array_equal(whole[1].get_ydata(), predictions.predicted[6, :, dimension])
     episode: Any = store.episodes[1]
-    last: Any = plots.draw_chunks(comparison, predictions, store, episode, np.array([23]), {})  # type: ignore[arg-type]
+    last: Any = plots.draw_chunks(comparison, predictions, store, episode, np.array([23]))
     assert len(last.axes) == 4, "a chunk ends with its episode"
     assert [1.1] in [pytest.approx(line.get_xdata()) for line in last.axes[0].lines]
 

@@ -114,10 +114,10 @@ def test_a_policy_outlives_the_renaming_of_its_source(trained_tiny, judged, tmp_
 
 
 def test_the_report_says_what_was_judged_and_which_streams_are_used(judged):
-    """One test episode: nothing can be shuffled or drawn anew, and the report says so."""
+    """One test episode: nothing can be drawn anew, and the report says so."""
     report, said = judged
     assert "sensor    zeroed" in said
-    assert "sensor shuffled: not judged" in said and "intervals take at least two" in said
+    assert "intervals take at least two" in said
     for name in PICTURES:
         assert (report / f"{name}.png").read_bytes().startswith(b"\x89PNG")
     assert "\nsensor delayed 50 ms," in (report / "streams.csv").read_text()
@@ -128,9 +128,6 @@ def test_the_report_says_what_was_judged_and_which_streams_are_used(judged):
     name, tested = next(iter(document["on"]["test"].items()))
     assert tested["ticks"] == [0, 30] and tested["group"] == name
     assert document["on"]["execute"] == 1
-    place = f"data/demo/recordings/{name.split('/')[1]}"
-    page = (report / "report.html").read_text()
-    assert f"No frames: there is no recording at {place} any more." in page
 
 
 def test_the_same_judgement_is_the_same_bytes_wherever_it_is_written(
