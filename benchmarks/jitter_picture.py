@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter, StrMethodFormatter
 from numpy.typing import NDArray
 
-from pipeline.look.page.style import INK, PALETTE, finish, logarithmic, panels
+from pipeline.look.page.style import INK, PALETTE, finish, panels
 from pipeline.robot.run_report import Timings
 
 _SLICES = 240
@@ -28,10 +28,11 @@ def jitter(runs: Mapping[str, tuple[float, Timings]]) -> Figure:
         for column, (part, style) in enumerate(zip(timings.parts, _styles(timings), strict=True)):
             if len(rows):
                 shares.ecdf(rows[:, column], complementary=True, lw=1.4, label=part, **style)
-        logarithmic(shares)
-        shares.set_xscale("log")
-        shares.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
-        shares.xaxis.set_minor_formatter(NullFormatter())
+        shares.set(xscale="log", yscale="log")
+        for scale in (shares.xaxis, shares.yaxis):
+            # Plain numbers: matplotlib's own labels are TeX.
+            scale.set_major_formatter(StrMethodFormatter("{x:g}"))
+            scale.set_minor_formatter(NullFormatter())
         shares.set(title=f"{name}: share of ticks above", xlim=(0.01, None), ylim=(None, 1))
         minutes = np.arange(len(rows)) / hz / 60
         for column, part in ((0, "late"), (-1, "tick")):

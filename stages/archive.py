@@ -58,11 +58,6 @@ def _places(params: "Params") -> tuple[Path, Path]:
             f"archive.output: expected a name that ends in .zarr, found {output}. "
             f"Set archive.output={output.with_name(output.name + '.zarr')}"
         )
-    if output.resolve().is_relative_to(store.resolve()):
-        raise ConfigError(
-            f"archive.output: {output} is the store {store} itself or lies in it. Name another "
-            "place, or set it to null for one beside the store."
-        )
     return store, output
 
 

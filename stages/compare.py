@@ -8,7 +8,7 @@ folds.
 
 Reads every folder in `compare.reports` that stages.evaluate wrote, and skips everything else there,
 such as the logs of a training. Writes report.html, experiments.csv and experiments.png into
-`compare.output`, and the tables as Markdown beside that folder.
+`compare.output`.
 
   python -m stages.compare                                   of bash experiments/experts.sh
   python -m stages.compare --set compare.reports=reports     reports/evaluate, reports/blind, …
@@ -28,11 +28,7 @@ def main(params: "Params") -> None:
     """Compare the evaluations in `compare.reports`."""
     from pipeline.base.files import (
         REPORT,
-        OutputKind,
-        begins_with,
         claim,
-        disk_full_named,
-        fresh,
         refuse_foreign,
     )
     from pipeline.evaluate.experiments import (
@@ -46,26 +42,18 @@ def main(params: "Params") -> None:
     from pipeline.look.comparison import comparison_report
     from pipeline.look.page.writing import write_report
 
-    table = OutputKind("a table of experiments", begins_with("| experiment |"))
     output = params.compare.output
-    markdown = output.with_name(f"{output.name}.md")
-    refuse_foreign(markdown, table)
     refuse_foreign(output, REPORT)
     experiments = read_experiments(params.compare.reports)
     claim(output, REPORT)
     files = [experiment_csv(experiments).write_csv(output / "experiments.csv")]
     files += write_report(output, comparison_report(experiments))
-    tables = {span: experiment_table(experiments, span) for span in SPANS}
-    with disk_full_named(markdown):
-        text = "\n".join(line for errors in tables.values() for line in [*errors.markdown(), ""])
-        fresh(markdown).write_text(text, encoding="utf-8")
-    for span, errors in tables.items():
-        print("\n".join(errors.text()))
-        best = best_experiment(experiments, span)
-        print(f"lowest test error of {SPANS[span]}: {best.name}\n")
+    for span, words in SPANS.items():
+        print("\n".join(experiment_table(experiments, span).text()))
+        print(f"lowest test error of {words}: {best_experiment(experiments, span).name}\n")
     if experiments[0].error("executed").low is None:
         print(NO_INTERVAL)
-    print(f"{', '.join(str(file) for file in [*files, markdown])}")
+    print(", ".join(map(str, files)))
 
 
 if __name__ == "__main__":

@@ -4,8 +4,6 @@ Reads what stages.train_head wrote to train_head.output, or evaluate.checkpoint 
 metrics.json, headline.json (what decides between policies, for `dvc metrics show`), tables (CSV)
 and a page with its pictures (report.html, PNG) into `evaluate.output`, and judged.json, which says
 what was evaluated on what. With `evaluate.modalities` it evaluates again with each stream ablated.
-The page shows frames of the best and the worst episode if their recordings are still below
-`data.root`.
 """
 
 import os
@@ -38,9 +36,7 @@ def main(params: "Params") -> None:
     checkpoint = load_policy(find_policy(folder))
     store = _store_for(checkpoint, params)
     device, say = resolve_device(params.evaluate.device), partial(print, flush=True)
-    evaluation = evaluate_checkpoint(
-        folder, checkpoint, store, params.evaluate, device, params.data.root, say
-    )
+    evaluation = evaluate_checkpoint(folder, checkpoint, store, params.evaluate, device, say)
     files = _write(params.evaluate.output, evaluation, _rollouts_page(params))
     print(error_text(evaluation.comparison, evaluation.energy))
     if evaluation.study is not None:

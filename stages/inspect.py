@@ -49,7 +49,6 @@ def main(params: "Params") -> None:
     """Write the page of what `inspect.path` names."""
     from pipeline.base.files import REPORT, claim
     from pipeline.look.page.blocks import FINDINGS
-    from pipeline.look.page.style import boxes
     from pipeline.look.page.writing import write_report
     from pipeline.look.subject import subject_of
 
@@ -65,9 +64,8 @@ def main(params: "Params") -> None:
     report = _report(subject, params)
     for folder in (params.inspect.output, subject.folder):
         claim(folder, REPORT)
-    with boxes() as notes:
-        page, *files = write_report(subject.folder, report)
-    print("\n".join([*summary(report), *notes]))
+    page, *files = write_report(subject.folder, report)
+    print("\n".join(summary(report)))
     pictures = sum(file.suffix == ".png" for file in files)
     print(f"{page}: the page, with {pictures} pictures and {FINDINGS} beside it")
 

@@ -3,8 +3,8 @@
 Reads probe.store (extract.store if null), and its checksums first (probe.check_store). It scores
 each slot, and each choice of layer, norm and pooling as a whole: alone, and together with past
 actions, state and sensor, cross-validated by recording. Prints the ranking with 95 % intervals and
-the line for params.yaml that the results support. Writes metrics.json, slots.csv, groups.csv,
-targets.csv and a page (report.html) into probe.output.
+the line for params.yaml that the results support. Writes metrics.json, slots.csv, groups.csv
+and a page (report.html) into probe.output.
 
   python -m stages.probe                             as params.yaml stands
   python -m stages.probe --set probe.max_ticks=2000  that many ticks, evenly spread: a first look

@@ -176,7 +176,7 @@ def test_metrics_and_plots_are_declared(project):
     assert len(evaluated) == 4 and rolled_out.keys() == {"success"}
     metrics = json.loads((project.folder / "reports/evaluate/metrics.json").read_text())
     assert evaluated["executed_error"] == metrics["executed"]["overall"]["policy"]["value"]
-    assert (project.folder / "reports/evaluate/scatter.png").exists()
+    assert (project.folder / "reports/evaluate/horizon.png").exists()
 
 
 def test_a_param_makes_its_own_stage_stale_and_none_before(tmp_path):

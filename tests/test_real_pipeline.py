@@ -133,4 +133,4 @@ def test_three_insertion_formats_share_a_store(run, shared_data, folder):
     said = run("train_head", "insertion", data)
     assert " test of " in said
     run("evaluate", "insertion", data)
-    assert (folder / "insertion/evaluate/scatter.png").stat().st_size > 10_000
+    assert (folder / "insertion/evaluate/horizon.png").stat().st_size > 10_000

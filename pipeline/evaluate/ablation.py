@@ -5,20 +5,18 @@ If the error stays the same, the policy does not use the stream, or other stream
 
 from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from pipeline.base.observation import Observation
 from pipeline.evaluate.baselines import Baselines
 from pipeline.evaluate.figures import Figure, times
 from pipeline.policy.checkpoint import PolicyCheckpoint
-from pipeline.policy.observation import VALIDITY, stream_of
 from pipeline.policy.policy import Policy
-from pipeline.store import Batch, FeatureStore, episode_name
+from pipeline.store import Batch, FeatureStore
 from pipeline.train.batches import NO_LAGS, BatchIndices, Lags, Prefetch, Ticks, Windows, evenly
 from pipeline.train.predictions import FeedMaker, predict
 from pipeline.train.scores import Comparison, action_space, compare
@@ -29,14 +27,10 @@ MOST_TICKS = 1000
 """The most test ticks: every way to ablate a stream costs a pass over them."""
 MOST_SAMPLES = 4
 """The most chunks a tick of a stochastic policy, for the same reason; their errors are averaged."""
-FIELDS = {
-    stream: tuple(field.name for field in fields(Observation) if stream_of(field.name) == stream)
-    for stream in ("sensor", "state", "features")
-}
-"""The fields of each stream: its values, which of them are valid, and their ages."""
+STREAMS = ("sensor", "state", "features")
 
-Alter = Callable[[BatchIndices, Batch], Batch]
-"""Returns the batch that the policy sees; does not change its arguments."""
+Alter = Callable[[Batch], Batch]
+"""Returns the batch that the policy sees; does not change its argument."""
 
 
 @dataclass(frozen=True)
@@ -45,7 +39,7 @@ class Ablated:
 
     stream: str
     how: str
-    """`zeroed`, `missing`, `shuffled` or `delayed 50 ms`."""
+    """`zeroed` or `delayed 50 ms`."""
     comparison: Comparison
     intact: Comparison
     """The policy with all streams, on the same ticks: those whose episode has this stream."""
@@ -95,7 +89,7 @@ def evaluate_ablation(
     ticks = evenly(settled, MOST_TICKS)
     windows, device = Windows.of(checkpoint.params), next(policy.parameters()).device
     ways: list[tuple[str, str, Ticks, FeedMaker | None]] = [("", "intact", ticks, None)]
-    for stream in (stream for stream in FIELDS if stream in policy.encoders):
+    for stream in (stream for stream in STREAMS if stream in policy.encoders):
         having = ticks[_having(store, ticks, stream)]
         if len(having) < len(ticks):
             notes.append(
@@ -105,13 +99,12 @@ def evaluate_ablation(
             continue
         if len(having) < len(ticks):
             ways.append((stream, "intact", having, None))
-        alterations, reasons = _alterations(checkpoint, store, having, stream)
-        notes += reasons
-        for how, alter in alterations.items():
-            ways.append((stream, how, having, feed_maker(store, windows, device, alter=alter)))
+        alter = zeroed(stream, checkpoint.typical(stream))
+        ways.append((stream, "zeroed", having, feed_maker(store, windows, device, alter=alter)))
         for how, lags in delays(store, stream).items():
             ways.append((stream, how, having, feed_maker(store, windows, device, lags)))
-        notes += _emptied(windows, stream)
+        if stream == "features":
+            notes.append(f"features delayed: by whole VL rows, of {_row_ms(store):.0f} ms each")
     space = action_space(store, checkpoint.normalization)
     intact: dict[str, Comparison] = {}
     ablated: list[Ablated] = []
@@ -140,44 +133,10 @@ def feed_maker(
         late = [replace(indices, lags=lags) for indices in plan]
         with Prefetch(store, late, windows, device) as batches:
             yield (
-                (indices, batch if alter is None else alter(indices, batch))
-                for indices, batch in batches
+                (indices, batch if alter is None else alter(batch)) for indices, batch in batches
             )
 
     return make
-
-
-def _alterations(
-    checkpoint: PolicyCheckpoint, store: FeatureStore, ticks: Ticks, stream: str
-) -> tuple[dict[str, Alter], list[str]]:
-    """Ways to alter a stream at these ticks, and notes for the reader of the results."""
-    ways, notes = {"zeroed": zeroed(stream, checkpoint.typical(stream))}, []
-    if _knows_missing(checkpoint, store, stream):
-        ways["missing"] = missing(stream)
-    else:
-        notes.append(f"{stream} missing: not judged, as training never showed it (drop_{stream} 0)")
-    donors = donors_of(store, ticks, stream)
-    if donors is None:
-        notes.append(f"{stream} shuffled: not judged, it takes two test episodes with it")
-    else:
-        windows = Windows.of(checkpoint.params)
-        ways["shuffled"] = exchanged(stream, store, windows, ticks, donors)
-    if stream == "features":
-        notes.append(f"features delayed: by whole VL rows, of {_row_ms(store):.0f} ms each")
-    return ways, notes
-
-
-def _knows_missing(checkpoint: PolicyCheckpoint, store: FeatureStore, stream: str) -> bool:
-    """Whether the policy was also trained on samples without this stream."""
-    if getattr(checkpoint.params, f"drop_{stream}") > 0:
-        return True
-    if stream == "features":
-        return False
-    readings = np.diff(store.array(f"episode/{stream}_start"))
-    return any(
-        not readings[episode.index] and episode_name(episode) in checkpoint.split["train"]
-        for episode in store.episodes
-    )
 
 
 def zeroed(stream: str, mean: NDArray[np.floating]) -> Alter:
@@ -187,51 +146,12 @@ def zeroed(stream: str, mean: NDArray[np.floating]) -> Alter:
     would show how the policy extrapolates, not how it does without the stream.
     """
 
-    def alter(indices: BatchIndices, batch: Batch) -> Batch:
+    def alter(batch: Batch) -> Batch:
         values = getattr(batch, stream)
         level = torch.tensor(mean, dtype=torch.float32, device=values.device)
         return replace(batch, **{stream: level.expand(*values.shape[:-1], level.shape[-1])})
 
     return alter
-
-
-def missing(stream: str) -> Alter:
-    """Every reading of the stream is invalid: its encoder gives the embedding for a missing one."""
-    valid = VALIDITY[stream]
-    return lambda indices, batch: replace(batch, **{valid: torch.zeros_like(getattr(batch, valid))})
-
-
-def exchanged(
-    stream: str, store: FeatureStore, windows: Windows, ticks: Ticks, donors: Ticks
-) -> Alter:
-    """Tick `ticks[i]` sees the stream as it is at tick `donors[i]`; `ticks` ascend."""
-
-    def alter(indices: BatchIndices, batch: Batch) -> Batch:
-        here = donors[np.searchsorted(ticks, indices.ticks)]
-        other = store.gather(here, **asdict(windows)).to(batch.action.device)
-        return replace(batch, **{name: getattr(other, name) for name in FIELDS[stream]})
-
-    return alter
-
-
-def donors_of(store: FeatureStore, ticks: Ticks, stream: str, seed: int = 0) -> Ticks | None:
-    """For each of these ascending ticks, one of them from another episode, drawn uniformly.
-
-    A tick whose episode lacks the stream is no donor and keeps itself. None where fewer than two
-    episodes have the stream.
-    """
-    having = _having(store, ticks, stream)
-    episode = store.episode_of(ticks)[having]
-    first = np.searchsorted(episode, episode, side="left")
-    size = np.searchsorted(episode, episode, side="right") - first
-    if len(episode) == 0 or (size == len(episode)).any():
-        return None
-    # An index into the ticks of other episodes: from the own episode on, it moves up by its size.
-    drawn = np.random.default_rng(seed).integers(0, len(episode) - size)
-    drawn = np.where(drawn < first, drawn, drawn + size)
-    donors = ticks.copy()
-    donors[having] = ticks[having][drawn]
-    return donors
 
 
 def _having(store: FeatureStore, ticks: Ticks, stream: str) -> NDArray[np.bool_]:
@@ -253,17 +173,6 @@ def delays(store: FeatureStore, stream: str) -> dict[str, Lags]:
     row_ms = _row_ms(store)
     rows = sorted({max(1, round(ms / row_ms)) for ms in DELAYS_MS})
     return {f"delayed {count * row_ms:.0f} ms": Lags(features=count) for count in rows}
-
-
-def _emptied(windows: Windows, stream: str) -> list[str]:
-    """Notes on delays that are longer than a stream's window in seconds."""
-    oldest_s = vars(windows).get(f"{stream}_window_s") or np.inf
-    return [
-        f"{stream} delayed {ms} ms: older than its window of {1000 * oldest_s:.0f} ms, so the "
-        "policy sees nothing of it"
-        for ms in DELAYS_MS
-        if ms / 1000 > oldest_s
-    ]
 
 
 def _row_ms(store: FeatureStore) -> float:

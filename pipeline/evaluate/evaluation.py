@@ -19,7 +19,6 @@ from pipeline.data.contact import contact_spans, force_columns
 from pipeline.evaluate.ablation import AblationStudy, evaluate_ablation
 from pipeline.evaluate.baselines import Baselines
 from pipeline.evaluate.figures import Figure, mean_over_ticks
-from pipeline.evaluate.sources import TrainingCurves, read_curves
 from pipeline.policy.checkpoint import PolicyCheckpoint
 from pipeline.policy.policy import Trainable
 from pipeline.store import Episode, FeatureStore
@@ -58,9 +57,6 @@ class Evaluation:
     study: AblationStudy | None
     judged: Mapping[str, Any]
     """What `judged_document` returns."""
-    curves: TrainingCurves
-    recordings: Path
-    """The root of the relative paths of the store's recordings."""
 
 
 def evaluate_checkpoint(
@@ -69,7 +65,6 @@ def evaluate_checkpoint(
     store: FeatureStore,
     wanted: EvaluateParams,
     device: torch.device,
-    recordings: Path,
     say: Callable[[str], None],
 ) -> Evaluation:
     """Evaluate the policy of the checkpoint in `folder` on its test ticks in a store that it fits.
@@ -122,8 +117,6 @@ def evaluate_checkpoint(
         energy=mean_over_ticks(energy, groups) if len(energy) else None,
         study=study,
         judged=judged,
-        curves=read_curves(checkpoint),
-        recordings=recordings,
     )
 
 

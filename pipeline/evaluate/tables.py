@@ -260,8 +260,8 @@ def evaluated_on(study: AblationStudy) -> str:
 def write_tables(folder: Path, evaluation: Evaluation) -> list[Path]:
     """Write metrics.json, its headline and the CSV files of all errors; see docs/reports.md.
 
-    Without a `study`, modalities.csv and streams.csv have only headings: `dvc plots` needs the
-    files, and those of an earlier evaluation must not stay.
+    Without a `study`, streams.csv has only headings: `dvc plots` needs the file, and that of an
+    earlier evaluation must not stay.
     """
     comparison, store, study = evaluation.comparison, evaluation.store, evaluation.study
     files = {
@@ -269,11 +269,9 @@ def write_tables(folder: Path, evaluation: Evaluation) -> list[Path]:
         "errors.csv": _group_errors(comparison),
         GROUPS: _recording_groups(comparison),
         "dimensions.csv": _dimensions(comparison),
-        "horizon.csv": _horizon(comparison),
         "steps.csv": _steps(comparison),
         "episodes.csv": _episodes(comparison, store),
         "predictions.csv": _predictions(comparison, evaluation.predictions, store),
-        "modalities.csv": _ablation_errors(study),
         "streams.csv": _streams(study),
     }
     figures = metrics(comparison, evaluation.energy)
@@ -324,16 +322,6 @@ def _dimensions(comparison: Comparison) -> Table:
     )
 
 
-def _horizon(comparison: Comparison) -> Table:
-    errors = [comparison.scores[method].mae_horizon for method in METHODS]
-    rows = [
-        [step, *dimension, *values]
-        for step, of_step in enumerate(np.stack(errors, axis=-1).tolist())
-        for *dimension, values in zip(comparison.names, comparison.units, of_step, strict=True)
-    ]
-    return Table(["steps_ahead", "dimension", "unit", *METHODS], rows)
-
-
 def _steps(comparison: Comparison) -> Table:
     """The overall error [training std] by steps ahead."""
     return Table.of(
@@ -364,20 +352,6 @@ def _predictions(comparison: Comparison, predictions: Predictions, store: Featur
     ]
     columns = (f"{name}_{what}" for name in comparison.names for what in ("recorded", "predicted"))
     return Table(["source", "episode", "time_s", *columns], rows)
-
-
-def _ablation_errors(study: AblationStudy | None) -> Table:
-    """The errors by stream, way to ablate it, and action group."""
-    rows: list[list[Any]] = []
-    if study is not None:
-        best = best_baseline(study.intact)
-        for way in study.ablated:
-            for group in (*study.intact.groups, None):
-                intact = (way.intact.error(method, group) for method in ("policy", best))
-                own = way.comparison.error("policy", group)
-                rows.append([way.stream, way.how, *_named(group).values(), own, *intact])
-    errors = ("error", "intact_error", "best_baseline_error")
-    return Table(["stream", "how", "group", "unit", *errors], rows)
 
 
 def _streams(study: AblationStudy | None) -> Table:

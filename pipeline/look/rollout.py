@@ -41,17 +41,15 @@ _CONTROLLERS = (
 )
 _MOMENTS = 8
 _NEAR_MM = 3.0
-"""How far from the target the close picture of the paths reaches."""
-_REACH = 1.3
-"""Reach of the whole picture, as a multiple of the greatest distance at which episodes begin."""
+"""How far from the target the picture of the paths reaches."""
 _WIDTH = 9.0
 _OTHER = "#999999"
 """Colour of an episode among many."""
 _OUTCOMES = {True: ("inserted", PALETTE[0], "o"), False: ("not inserted", PALETTE[5], "X")}
 _GOOD, _WIDE = 0.9, 0.15
 """A rate from which a policy may go on to an arm; a width of its interval that says little."""
-_MANY = 100
-"""With more episodes than this, the page has the paths as pixels: thousands of lines are slow."""
+_THIN: dict[str, Any] = {"lw": 0.8, "alpha": 0.45, "rasterized": True}
+"""A line among many. They are pixels in the page: thousands of lines are slow."""
 
 
 def rollout_report(rollouts: Rollouts) -> Report:
@@ -154,7 +152,7 @@ def _paths_and_courses(rollouts: Rollouts) -> list[Block]:
     above = (
         "The path of the needle's tip as seen from the target. Points are where it punctured, or "
         "where it ended when it never did; in the circle, an insertion may succeed. Where a push "
-        "moves the target, a line jumps. The picture cuts off what goes farther."
+        "moves the target, a line jumps. What lies farther is cut off."
     )
     over_time = (
         "A thin line is an episode. The tip should be near the target before it goes below the "
@@ -169,37 +167,37 @@ def _paths_and_courses(rollouts: Rollouts) -> list[Block]:
 
 
 def draw_paths(rollouts: Rollouts) -> Figure:
-    """The tip's paths of policy and demonstrator, seen from above; the lower row is close up."""
+    """The last of the tip's paths of policy and demonstrator, seen from above."""
     shown = [name for name in ("policy", "expert") if rollouts.of(name)]
-    begins = [_trace(episode).offset_mm[:1] for name in shown for episode in rollouts.of(name)]
-    far = max(_NEAR_MM, _REACH * float(np.abs(np.concatenate(begins)).max()))
-    size = _WIDTH * max(len(shown), 1.4) / 2, _WIDTH + 0.9
-    figure, axes = panels(*size, 2, len(shown), squeeze=False)
-    for column, name in zip(axes.T, shown, strict=True):
-        _draw_all(column[0], rollouts.of(name), far)
-        _draw_all(column[1], rollouts.of(name), _NEAR_MM)
-        column[0].set_title(f"{controller_name(name)}: whole paths")
-        column[1].set_title(f"{controller_name(name)}: the last {_NEAR_MM:g} mm")
+    figure, axes = panels(_WIDTH * max(len(shown), 1.4) / 2, 5.4, 1, len(shown), squeeze=False)
+    for axis, name in zip(axes[0], shown, strict=True):
+        _draw_all(axis, rollouts.of(name))
+        axis.set_title(f"{controller_name(name)}: the last {_NEAR_MM:g} mm")
     finish(figure, axes[0, 0], 3, "Seen from above, the target in the middle")
     return figure
 
 
-def _draw_all(axis: Axes, episodes: Sequence[RolloutEpisode], reach_mm: float) -> None:
-    """Draw the path of each episode from where it last comes within reach."""
+def _draw_all(axis: Axes, episodes: Sequence[RolloutEpisode]) -> None:
+    """Draw the path of each episode from where it last comes near."""
     for episode in episodes:
         offset_mm = _trace(episode).offset_mm
-        (outside,) = np.nonzero(np.abs(offset_mm).max(axis=1) > reach_mm)
-        style: dict[str, Any] = {"lw": 0.8, "alpha": 0.45, "rasterized": len(episodes) > _MANY}
+        (outside,) = np.nonzero(np.abs(offset_mm).max(axis=1) > _NEAR_MM)
         shown = offset_mm[outside[-1] if len(outside) else 0 :]
-        axis.plot(*shown.T, color=_OUTCOMES[episode.success][1], **style)
+        axis.plot(*shown.T, color=_OUTCOMES[episode.success][1], **_THIN)
     around = MISS_MM * np.exp(2j * np.pi * np.arange(91) / 90)
     label = f"{MISS_MM:g} mm from the target"
     axis.plot(around.real, around.imag, color=INK, lw=1.6, zorder=6, label=label)
     for outcome, (label, colour, marker) in _OUTCOMES.items():
         ends = [_trace(episode).lateral_mm for episode in episodes if episode.success == outcome]
-        style = {"s": 34, "color": colour, "edgecolors": "white", "lw": 0.6, "zorder": 7}
+        style: dict[str, Any] = {
+            "s": 34,
+            "color": colour,
+            "edgecolors": "white",
+            "lw": 0.6,
+            "zorder": 7,
+        }
         axis.scatter(*np.reshape(ends, (-1, 2)).T, marker=marker, label=label, **style)
-    axis.set(xlim=(-reach_mm, reach_mm), ylim=(-reach_mm, reach_mm), aspect="equal")
+    axis.set(xlim=(-_NEAR_MM, _NEAR_MM), ylim=(-_NEAR_MM, _NEAR_MM), aspect="equal")
     axis.set(xlabel="x [mm]", ylabel="y [mm]")
 
 
@@ -211,9 +209,8 @@ def draw_courses(
     `strong` are the episodes with a thick line, by their legend entry.
     """
     figure, axes = panels(_WIDTH, 10.0, 4)
-    pixels = len(episodes) > _MANY
     for episode in episodes:
-        _draw_course(axes, episode, color=_OTHER, lw=0.7, alpha=0.5, rasterized=pixels)
+        _draw_course(axes, episode, color=_OTHER, **_THIN)
     for (label, episode), colour in zip(strong.items(), (PALETTE[1], INK), strict=False):
         _draw_course(axes, episode, color=colour, lw=2.4, label=label, zorder=5)
     _mark_limits(axes)

@@ -5,17 +5,12 @@ changed, and little memory is used: only arrays of a few bytes for each tick or 
 whole; of the features, one slot of `inspect.points` VL rows is read at a time.
 """
 
-import re
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.colors import LinearSegmentedColormap
-from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from tqdm import tqdm
 
@@ -29,18 +24,14 @@ from pipeline.look.page.blocks import (
     Block,
     Issues,
     Outline,
-    Picture,
     Report,
     Section,
     Text,
     next_steps,
 )
-from pipeline.look.page.style import GRID, PALETTE, draw_map, panels
-from pipeline.store import FEATURES, KEY_BYTES, Episode, FeatureStore, check_trailers, episode_name
+from pipeline.store import FEATURES, KEY_BYTES, Episode, FeatureStore, check_trailers
 from pipeline.store.border import extract_command
-from pipeline.store.chunks import check_row_checksums
 from pipeline.store.gather import WIDE
-from pipeline.store.schema import read_spec
 from pipeline.vlm.slots import slot_name
 
 NOTHING = "Nothing looks wrong: every check passed."
@@ -50,14 +41,7 @@ DEAD = 1e-3
 """A slot is dead if the spread of its numbers is below this share of their size."""
 _STALE_PERIODS = 2
 """Features are old beyond this multiple of the period of VL rows."""
-_SAME_SHARE = 0.5
-"""Two episodes are the same recording if they share at least this share of their rows."""
-_BLOCK_BYTES = 2**24
 _TINY = 1e-30
-_NAMED_SLOTS = 20
-_LINE = "#222222"
-"""Colour of lines between sources: a map is light on a dark page too, where ink is white."""
-_AROUND = LinearSegmentedColormap.from_list("around", ("#0072B2", "#f0f0f0", "#D55E00"))
 
 
 @dataclass(frozen=True)
@@ -80,16 +64,12 @@ class Coverage:
 
 @dataclass(frozen=True, eq=False)
 class FeatureHealth:
-    """Length and spread of the features of some VL rows, by slot; only of the plain frames."""
+    """Whether the features of some VL rows vary and are finite, by slot; of plain frames only."""
 
     rows: NDArray[np.int64]
     """(row,) ascending, in the store."""
-    episode: NDArray[np.int64]
-    """(row,) index of the episode."""
     names: tuple[str, ...]
     """(slot,) the names of the slots."""
-    norm: NDArray[np.float32]
-    """(row, slot) Euclidean; NaN where the slot is invalid or not finite."""
     variation: NDArray[np.float64]
     """(slot,) the median over its numbers of standard deviation / root mean square: 0 = dead."""
     broken: NDArray[np.bool_]
@@ -104,8 +84,8 @@ class StoreView:
     episodes: tuple[Coverage, ...]
     ages: Mapping[str, NDArray[np.float32]]
     """`newest frame` and each view -> (tick,) s since its frame was captured; NaN without one."""
-    shared_rows: int
-    """VL rows whose key another row has."""
+    distinct_rows: int
+    """VL rows that differ in their frames, prompt or feature spec."""
     features: FeatureHealth
     bytes: int
     """Size on the disk."""
@@ -116,10 +96,10 @@ class StoreView:
 def inspect_store(path: str | Path, params: InspectParams) -> StoreView:
     """Everything that the page shows of a finished store.
 
-    Checks the checksums of metadata, of every narrow array and of the `params.points` VL rows that
-    are looked at; stages.verify checks the rest. Raises `StoreIncomplete` where the store is not
-    there, unfinished, damaged or without an episode, `StoreMismatch` where it is an archive or
-    follows another schema; each says what to run.
+    Checks the checksums of metadata and of every narrow array, and looks at the features of
+    `params.points` VL rows; stages.verify checks the rest. Raises `StoreIncomplete` where the store
+    is not there, unfinished, damaged or without an episode, `StoreMismatch` where it is an archive
+    or follows another schema; each says what to run.
     """
     store = FeatureStore.open(path)
     check_trailers(store.path, but=tuple(WIDE.values()))
@@ -127,19 +107,17 @@ def inspect_store(path: str | Path, params: InspectParams) -> StoreView:
         raise StoreIncomplete(f"{path}: has no VL row. Run {extract_command(store.path)}.")
     count = min(total, params.points)
     rows = np.arange(count, dtype=np.int64) * total // count
-    _check_rows(store, rows)
     episodes = tuple(read_coverage(store, episode) for episode in store.episodes)
     ages, health = read_ages(store), measure_features(store, rows)
-    shared_rows, same = find_shared_rows(store, episodes)
+    keys = np.ascontiguousarray(store.array("vl/key")).view(f"V{KEY_BYTES}").ravel()
     issues = (
         *find_coverage_issues(episodes),
         *find_age_issues(store, episodes, ages["newest frame"]),
         *find_feature_issues(health, episodes),
-        *same,
     )
     files = (file.stat() for file in store.path.rglob("*") if file.is_file())
     taken = sum(status.st_blocks * 512 for status in files)
-    return StoreView(store, episodes, ages, shared_rows, health, taken, issues)
+    return StoreView(store, episodes, ages, len(np.unique(keys)), health, taken, issues)
 
 
 def store_report(view: StoreView) -> Report:
@@ -172,7 +150,6 @@ def store_report(view: StoreView) -> Report:
             Section("What looks wrong", [Issues(view.issues, NOTHING), _checked(view, total)]),
             Section("Coverage", [_source_table(episodes), _episode_table(episodes)]),
             Section("Reuse of the features", _reuse_blocks(view, total)),
-            Section("Features", _feature_blocks(view, total)),
             Section(
                 "What it was made of",
                 [
@@ -193,11 +170,12 @@ def store_report(view: StoreView) -> Report:
 
 
 def _checked(view: StoreView, total: int) -> Text:
-    count = len(view.features.rows)
-    which = f"all {total:,}" if count == total else f"{count:,} of {total:,}"
     verify = command("verify", setting("verify.store", view.store.path))
-    words = f"Metadata, clocks, offsets and the features of {which} VL rows give the checksums"
-    return Text(f"{words} that were written with them; `{verify}` reads every byte.")
+    return Text(
+        "Metadata, clocks and offsets give the checksums that were written with them. Looked at: "
+        f"the features of {len(view.features.rows):,} of {total:,} VL rows (`inspect.points`), "
+        f"plain frames only; `{verify}` reads every byte."
+    )
 
 
 def read_coverage(store: FeatureStore, episode: Episode) -> Coverage:
@@ -291,30 +269,6 @@ def find_age_issues(
             yield part.issue("old frames", "vl/frame_time", message)
 
 
-def find_shared_rows(store: FeatureStore, episodes: Sequence[Coverage]) -> tuple[int, list[Issue]]:
-    """How many VL rows share a key with another row, and an issue for episodes with the same rows.
-
-    Equal keys mean equal frames, prompt and feature spec.
-    """
-    keys = np.ascontiguousarray(store.array("vl/key")).view(f"V{KEY_BYTES}").ravel()
-    _, key, counts = np.unique(keys, return_inverse=True, return_counts=True)
-    lengths = np.diff(store.array("episode/vl_start"))
-    owner = np.repeat(np.arange(len(lengths)), lengths)
-    first = np.full(len(counts), len(lengths))
-    np.minimum.at(first, key, owner)
-    later = first[key] < owner
-    pairs, shared = np.unique(
-        np.column_stack([first[key], owner])[later], axis=0, return_counts=True
-    )
-    issues: list[Issue] = []
-    for (a, b), count in zip(pairs.tolist(), shared.tolist(), strict=True):
-        if count >= _SAME_SHARE * min(lengths[a], lengths[b]):
-            message = f"{count} of its {lengths[b]} VL rows have exactly the frames and prompt of "
-            message += f"rows of {episode_name(episodes[a].episode)}"
-            issues.append(episodes[b].issue("same recording", "vl/key", message))
-    return int((counts[key] > 1).sum()), issues
-
-
 def _reuse_blocks(view: StoreView, total: int) -> list[Block]:
     """Ages of the features, and how many rows occur twice."""
     rows = [
@@ -328,42 +282,25 @@ def _reuse_blocks(view: StoreView, total: int) -> list[Block]:
         Text("The policy is given the age of the newest frame as `feature_age`."),
         Table(("age [s] of", "1 %", "median", "99 %", "oldest"), rows),
         Text(
-            f"{view.shared_rows:,} of {total:,} VL rows have exactly the frames and prompt of "
-            f"another row.{augmented}"
+            f"{view.distinct_rows:,} of {total:,} VL rows differ in their frames or prompt."
+            f"{augmented}"
         ),
     ]
 
 
-def _check_rows(store: FeatureStore, rows: NDArray[np.int64]) -> None:
-    """Raise `StoreIncomplete` if one of these VL rows does not have its checksum."""
-    features, checksums = store.array(FEATURES), store.array("vl/checksum")
-    spec = read_spec(store.path, FEATURES)
-    for block in np.array_split(rows, max(1, len(rows) * features[:1].nbytes // _BLOCK_BYTES)):
-        check_row_checksums(store.path, spec, block, features[block], checksums[block])
-
-
 def measure_features(store: FeatureStore, rows: NDArray[np.int64]) -> FeatureHealth:
-    """Norms and variation of these rows, slot after slot."""
-    count, slots = len(rows), store.feature_shape[0]
-    episode = np.searchsorted(store.array("episode/vl_start"), rows, side="right") - 1
-    norm = np.full((count, slots), np.nan, np.float32)
+    """Variation and finiteness of these rows, slot after slot."""
+    slots = store.feature_shape[0]
     variation = np.full(slots, np.nan)
-    broken = np.zeros((count, slots), np.bool_)
+    broken = np.zeros((len(rows), slots), np.bool_)
     for slot in tqdm(range(slots), desc="look at features", unit="slot", disable=None):
-        values = read_slot(store, rows, slot)
+        values = widen(store.array(FEATURES)[rows, slot]).astype(np.float32, copy=False)
         valid = store.array("vl/slot_valid")[rows, slot] != 0
         broken[:, slot] = valid & non_finite(values).any(axis=1)
-        valid &= ~broken[:, slot]
-        norm[valid, slot] = np.linalg.norm(values[valid], axis=1)
-        variation[slot] = _variation(values[valid])
+        variation[slot] = _variation(values[valid & ~broken[:, slot]])
     # Variants repeat the names.
     names = tuple(slot_name(document) for document in store.attrs["slots"][:slots])
-    return FeatureHealth(rows, episode, names, norm, variation, broken)
-
-
-def read_slot(store: FeatureStore, rows: NDArray[np.int64], slot: int) -> NDArray[np.float32]:
-    """(row, dim) of one slot of the plain frames, whatever dtype it is stored in."""
-    return widen(store.array(FEATURES)[rows, slot]).astype(np.float32, copy=False)
+    return FeatureHealth(rows, names, variation, broken)
 
 
 def _variation(values: NDArray[np.float32]) -> float:
@@ -380,78 +317,11 @@ def find_feature_issues(health: FeatureHealth, episodes: Sequence[Coverage]) -> 
     if dead := np.flatnonzero(health.variation < DEAD).tolist():
         message = f"{named(health.names, dead)}: the same in all VL rows looked at"
         yield Issue(severity="warning", kind="dead slot", message=message, stream=FEATURES)
-    for index, part in enumerate(episodes):
-        own = health.episode == index
-        if len(row := np.nonzero(health.broken[own])[0]):
-            slot = health.broken[own][row[0]].argmax()
+    for part in episodes:
+        rows = part.episode.vl_rows
+        own = health.broken[(rows.start <= health.rows) & (health.rows < rows.stop)]
+        if len(row := np.nonzero(own)[0]):
+            slot = own[row[0]].argmax()
             message = f"{len(np.unique(row))} VL row(s) are NaN or infinite, the first in slot "
             message += f"{health.names[slot]}; training refuses them: extract them anew"
             yield part.issue("not finite", FEATURES, message, severity="error")
-
-
-def _feature_blocks(view: StoreView, total: int) -> list[Block]:
-    """Which rows were read, and the picture of their norms."""
-    health = view.features
-    words = "Looked at: all VL rows"
-    if len(health.rows) < total:
-        words = f"Looked at: {len(health.rows):,} of {total:,} VL rows (`inspect.points`)"
-    if broken := int(health.broken.any(axis=1).sum()):
-        words += f", without what is not finite in {broken:,} of them"
-    if not np.isfinite(health.norm).any():
-        return [Text(f"{words}; none has finite features.")]
-    caption = "Norm of the features by slot, and the median in each episode / in all."
-    picture = Picture("norms", caption, partial(draw_norms, health, view.episodes))
-    return [Text(f"{words}. Of augmented variants, plain frames only."), picture]
-
-
-def draw_norms(health: FeatureHealth, episodes: Sequence[Coverage]) -> Figure:
-    """Norms of the features: by slot on the left, by slot and episode on the right."""
-    slots = len(health.names)
-    figure, (left, right) = panels(
-        9.5, 3.0 + min(5.0, 0.3 * slots), 1, 2, sharey=True, width_ratios=(1, 1.7)
-    )
-    at = np.arange(slots)
-    low, middle, high = _quantiles(health.norm, (0.01, 0.5, 0.99))
-    left.hlines(at, low, high, color=PALETTE[4], lw=min(5.0, 160 / slots), label="1 to 99 %")
-    left.plot(middle, at, "o", color=PALETTE[0], ms=min(5.0, 120 / slots), label="median")
-    left.set_xlabel("norm of the features")
-    left.set_ylim(slots - 0.5, -0.5)
-    # With many slots, only the first of those that differ just in their cell is named.
-    stems = (
-        health.names
-        if slots <= _NAMED_SLOTS
-        else [re.sub(r" \d+,\d+$", "", n) for n in health.names]
-    )
-    first = [number for number in range(slots) if stems[number] not in stems[:number]]
-    left.set_yticks(first, [stems[number] for number in first])
-    ratio = np.full((slots, len(episodes)), np.nan)
-    for index in np.unique(health.episode):
-        (median,) = _quantiles(health.norm[health.episode == index], (0.5,))
-        ratio[:, index] = median / middle
-    most = max(0.02, *np.abs(ratio[np.isfinite(ratio)] - 1))
-    right.set_facecolor(GRID)
-    image = draw_map(right, ratio, (1 - most, 1 + most), _AROUND, numbered=False)
-    right.tick_params(left=False)
-    _mark_sources(right, [part.episode.source for part in episodes])
-    figure.colorbar(image, ax=right, label="median in the episode / in all", pad=0.02)
-    figure.legend(*left.get_legend_handles_labels(), loc="outside lower left", ncols=2)
-    return figure
-
-
-def _quantiles(norm: NDArray[np.float32], shares: Sequence[float]) -> NDArray[np.float64]:
-    """(share, slot) over the rows where it is finite; NaN where it never is."""
-    out = np.full((len(shares), norm.shape[1]), np.nan)
-    there = np.isfinite(norm).any(axis=0)
-    out[:, there] = np.nanquantile(norm[:, there], shares, axis=0)
-    return out
-
-
-def _mark_sources(axis: Axes, sources: Sequence[str]) -> None:
-    """Draw sources and their numbers of episodes below an axis of episodes, with lines between."""
-    starts = [at for at, source in enumerate(sources) if not at or source != sources[at - 1]]
-    for start in starts[1:]:
-        axis.axvline(start - 0.5, color=_LINE, lw=1.0)
-    counts = np.diff([*starts, len(sources)])
-    labels = [f"{sources[start]}\n{count}" for start, count in zip(starts, counts, strict=True)]
-    axis.set_xticks(starts + (counts - 1) / 2, labels)
-    axis.set_xlabel("episodes, by source")

@@ -6,9 +6,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from shlex import quote
 
-from pipeline.base.commands import command
 from pipeline.base.config import InspectParams, Params, Source
 from pipeline.base.errors import ConfigError, RecordingError
 from pipeline.base.files import REPORT, refuse_foreign
@@ -45,11 +43,10 @@ def subject_of(params: Params) -> Subject:
     """The subject at `inspect.path`, or the recordings of `data.sources` without a path.
 
     A store is known by its content or its name. Raises `ConfigError` for a path that is not there
-    or is a file, for a store beside other paths, and for an output that cannot be written to.
+    or is a file, and for an output that holds something else.
     """
     wanted = params.inspect
     places = (wanted.path,) if isinstance(wanted.path, str) else wanted.path or ()
-    _check_output(wanted.output)
     folder = _folder(wanted, places)
     for place in (wanted.output, folder):
         refuse_foreign(place, REPORT)
@@ -67,28 +64,12 @@ def subject_of(params: Params) -> Subject:
         for place in places
         for match in sorted(glob.glob(place, recursive=True)) or [place]  # noqa: PTH207
     ]
-    stores = [path for path in matches if _is_store(path)]
-    if stores and len(matches) > 1:
-        raise ConfigError(
-            f"inspect.path: {stores[0]} is a store, and {len(matches) - 1} more paths are named. "
-            f"Look at it alone: {command('inspect', quote(str(stores[0])))}"
-        )
     # The last part of the first path that is not a pattern.
     parts = [part for part in Path(places[0]).absolute().parts if not glob.has_magic(part)]
     name = parts[-1].strip("/") or "recordings"
     source = Source(name=name, path=tuple(places), format=wanted.format)
-    return Subject(" ".join(places), folder, stores[0] if stores else None, (source,), Path())
-
-
-def _check_output(folder: Path) -> None:
-    """Raise `ConfigError` before anything is read, if the page could not be written."""
-    places = [folder.absolute(), *folder.absolute().parents]
-    there = next(place for place in places if place.exists())
-    wrong = "" if os.access(there, os.W_OK | os.X_OK) else f"{there} cannot be written to"
-    if not there.is_dir():
-        wrong = f"expected a folder, found the file {there}"
-    if wrong:
-        raise ConfigError(f"inspect.output: {wrong}. Name another: --set inspect.output=FOLDER")
+    store = matches[0] if len(matches) == 1 and _is_store(matches[0]) else None
+    return Subject(" ".join(places), folder, store, (source,), Path())
 
 
 def _is_store(path: Path) -> bool:

@@ -172,17 +172,6 @@ class Comparison:
         """
         return np.argsort(self.overall_by_episode("policy"), kind="stable").tolist()
 
-    def extremes(self) -> list[tuple[str, int]]:
-        """The episodes of lowest and highest error, each with its name and store index.
-
-        There is a single entry if there is one episode.
-        """
-        order = self.ranked()
-        best, worst = order[0], order[-1]
-        if best == worst:
-            return [("the only episode", self.episodes[best])]
-        return [("lowest error", self.episodes[best]), ("highest error", self.episodes[worst])]
-
     def varying(self) -> list[int]:
         """The dimensions that vary in training; all, where none does."""
         dimensions = np.flatnonzero(self.scale > 0).tolist()

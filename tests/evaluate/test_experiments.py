@@ -185,18 +185,6 @@ def test_one_group_has_no_interval(written: Written) -> None:
     assert table.rows[1][2] == "+0.100"
 
 
-@pytest.mark.parametrize("groups", [11, 12])
-def test_other_baselines_are_refused(written: Written, groups: int) -> None:
-    on = {"horizon": 8, "test": {}}
-    reports = written("a", HARD, on=on)
-    written("b", HARD[:groups], on=on)
-    if groups == 12:
-        file = reports / "b" / GROUPS
-        file.write_text(file.read_text().replace(",0.3,", ",0.31,"))
-    with pytest.raises(ConfigError, match=r"same baselines .*found zero_action"):
-        read_experiments(reports)
-
-
 def test_the_neighbour_in_other_features_is_another(written: Written) -> None:
     reports = written("a", HARD)
     written("b", HARD)

@@ -92,16 +92,6 @@ def test_a_ratio_of_the_same_ticks_is_paired() -> None:
     assert times(compared(hard, hard), compared(0 * hard, hard)) is None
 
 
-def test_phases_are_parts_of_the_same_sum() -> None:
-    phase = np.tile(["approach", "hold"], GROUPS * 5)
-    found = compared(errors(1.0), errors(2.0), phase=phase)
-    parts = [found.of_phase(name) for name in ("approach", "hold")]
-    assert [part.ticks for part in parts] == [GROUPS * 5] * 2
-    whole = sum(part.scores["policy"].absolute.sum() for part in parts)
-    assert whole == pytest.approx(found.scores["policy"].absolute.sum())
-    assert error(parts[0], "policy").low is not None
-
-
 def test_figures_read_alike() -> None:
     for figure, sign, text in (
         (Figure(0.27891, 0.25, 0.3049), "", "0.279 (0.250–0.305)"),
@@ -118,29 +108,10 @@ def test_a_mean_over_ticks_weighs_ticks_and_draws_groups() -> None:
     assert (figure.value, figure.low, figure.high) == (2.0, 1.0, 4.0)
 
 
-def test_the_interval_covers_the_mean_about_as_often_as_it_promises() -> None:
-    generator = np.random.default_rng(3)
-    covered = 0
-    for seed in range(200):
-        sums = generator.normal(1.0, 2.0, (40, 1))
-        figure = Figure.of(1.0, bootstrap_means(sums, np.ones((40, 1)), 500, seed))
-        covered += figure.low <= 1.0 <= figure.high
-    assert 0.88 <= covered / 200 <= 0.99
-
-
 def test_a_draw_is_the_ratio_of_its_sums_so_long_groups_weigh_more() -> None:
     sums, counts = np.array([[2.0], [90.0]]), np.array([[1.0], [10.0]])
     draws = bootstrap_means(sums, counts, 400)
     assert {round(float(value), 9) for value in draws[:, 0]} == {2.0, round(92 / 11, 9), 9.0}
-
-
-def test_equal_seeds_draw_equal_groups_so_differences_are_paired() -> None:
-    first = np.arange(12.0)[:, None]
-    counts = np.ones((12, 1))
-    apart = bootstrap_means(first + 0.5, counts) - bootstrap_means(first, counts)
-    assert np.allclose(apart, 0.5)
-    together = bootstrap_means(np.hstack([first, first + 0.5]), counts)
-    assert np.array_equal(together[:, :1], bootstrap_means(first, counts))
 
 
 def test_a_figure_that_no_drawn_group_counts_is_no_number_and_others_stay() -> None:

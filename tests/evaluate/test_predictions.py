@@ -65,11 +65,6 @@ def test_the_error_is_that_of_one_sample_with_the_noise_of_many(store: FeatureSt
     assert np.array_equal(many.error, run(Noisy(), store, 400).error)
 
 
-def test_the_noise_is_of_the_batch_so_that_its_size_decides_too(store: FeatureStore) -> None:
-    at_once = predict(Noisy(), store, TICKS, WINDOWS, 64, samples=4)  # type: ignore[arg-type]
-    assert not np.array_equal(at_once.predicted, run(Noisy(), store, 4).predicted)
-
-
 def test_no_more_chunks_at_once_than_memory_is_promised(store, monkeypatch):
     monkeypatch.setattr(predictions, "_CHUNKS_AT_ONCE", 16)
     policy = Noisy()
@@ -77,12 +72,6 @@ def test_no_more_chunks_at_once_than_memory_is_promised(store, monkeypatch):
     # Two whole batches of 8 ticks, then one of 5.
     assert policy.asked == [2, 2, 1] * 2 + [3, 2]
     assert found.sampled is not None
-
-
-def test_a_policy_that_does_not_sample_is_asked_once(store: FeatureStore) -> None:
-    policy = StandIn()
-    run(policy, store, 16)
-    assert policy.asked == [1, 1, 1]
 
 
 def test_the_policy_sees_what_the_feed_hands_out(store: FeatureStore) -> None:
@@ -98,8 +87,8 @@ def test_the_policy_sees_what_the_feed_hands_out(store: FeatureStore) -> None:
 
     calls = []
 
-    def negated(draw, batch):
-        calls.append(len(draw.ticks))
+    def negated(batch):
+        calls.append(len(batch))
         return replace(batch, sensor=-batch.sensor)
 
     altered = run(StandIn(), store, 1, feed=feed_maker(store, WINDOWS, device, NO_LAGS, negated))

@@ -5,14 +5,12 @@ import json
 import re
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
-from pipeline.base.errors import DiskFull
 from pipeline.evaluate.baselines import BASELINES, METHODS
 from pipeline.evaluate.figures import NO_INTERVAL, Figure, rivalry
 from pipeline.evaluate.tables import error_table, error_text, metrics, write_tables
@@ -141,16 +139,9 @@ def test_files_hold_every_dimension_step_episode_and_tick(comparison, prediction
     assert float(groups["overall"]["repeat_last"]) == pytest.approx(
         comparison.overall("repeat_last"), rel=1e-5
     )
-    assert rows["modalities"] == rows["streams"] == [], "headings alone, for nobody asked"
-    assert [len(rows[name]) for name in ("dimensions", "horizon", "episodes", "predictions")] == [
-        5,
-        4 * 5,
-        2 * 3,
-        60,
-    ]
+    assert rows["streams"] == [], "headings alone, for nobody asked"
+    assert [len(rows[name]) for name in ("dimensions", "episodes", "predictions")] == [5, 6, 60]
     assert float(rows["dimensions"][3]["policy"]) == pytest.approx(0.5)
-    assert float(rows["horizon"][6]["policy"]) == pytest.approx(0.2)
-    assert rows["horizon"][6]["dimension"] == "dy"
     steps = [float(row["policy"]) for row in rows["steps"]]
     assert [row["steps_ahead"] for row in rows["steps"]] == ["0", "1", "2", "3"]
     assert np.mean(steps) == pytest.approx(comparison.overall("policy"), rel=0.02)
@@ -167,25 +158,3 @@ def test_a_step_no_chunk_reaches_is_empty(recorded, compared, store, tmp_path):
     write_tables(tmp_path, judged(compared(predictions), predictions, store))
     lines = (tmp_path / "steps.csv").read_text().splitlines()
     assert lines[3:] == [f"2{',' * 18}", f"3{',' * 18}"] and ",," not in lines[2]
-
-
-def test_what_a_report_is_linked_to_is_not_written(comparison, predictions, store, tmp_path):
-    """As DVC restores an output: every file a link into its cache."""
-    report, cache = tmp_path / "report", tmp_path / "cache"
-    report.mkdir()
-    cache.mkdir()
-    for name in ("metrics.json", "dimensions.csv", "horizon.csv", "episodes.csv"):
-        (cache / name).write_text("as it was")
-        (report / name).hardlink_to(cache / name)
-    write_tables(report, judged(comparison, predictions, store))
-    assert {file.read_text() for file in cache.iterdir()} == {"as it was"}
-    assert json.loads((report / "metrics.json").read_text()) == metrics(comparison)
-
-
-def test_a_full_disk_is_named(comparison, predictions, store, monkeypatch, tmp_path):
-    def full(path: Path, *rest: object, **named: object) -> None:
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(Path, "open", full)
-    with pytest.raises(DiskFull, match=str(tmp_path)):
-        write_tables(tmp_path, judged(comparison, predictions, store))

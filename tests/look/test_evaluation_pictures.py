@@ -1,7 +1,5 @@
 """Pictures are written for any shape of data, whole, and the same for the same numbers."""
 
-from dataclasses import replace
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -9,12 +7,10 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from pipeline.evaluate.ablation import Ablated, AblationStudy
 from pipeline.evaluate.baselines import BASELINES
 from pipeline.evaluate.probe.inputs import SlotName
 from pipeline.evaluate.probe.ridge import ProbeFolds, ProbeScore
 from pipeline.evaluate.probe.study import Known, ProbeResult, ProbeStudy
-from pipeline.evaluate.sources import TrainingCurve, TrainingCurves
 from pipeline.look import evaluation as plots
 from pipeline.look import probe
 from pipeline.look.page.style import write
@@ -59,21 +55,15 @@ def evaluated(
 
 
 def pictures(comparison: Comparison, predictions: Predictions, store: Any) -> dict[str, Any]:
-    """Each picture of an evaluation by its file's name; frames of two views for one episode."""
-    rng = np.random.default_rng(0)
-    frames = {name: rng.integers(0, 255, (2, 12, 16, 3), np.uint8) for name in ("A", "B")}
+    """Each picture of an evaluation by its file's name."""
     instants = predictions.ticks[predictions.episodes == comparison.episodes[0]][[0, 6]]
 
     def chunks() -> Figure:
-        return plots.draw_chunks(
-            comparison, predictions, store, store.episodes[0], instants, frames
-        )
+        return plots.draw_chunks(comparison, predictions, store, store.episodes[0], instants)
 
     return {
-        "scatter.png": lambda: plots.draw_scatter(comparison, predictions),
         "horizon.png": lambda: plots.draw_horizon(comparison, store.action_hz),
         "methods.png": lambda: plots.draw_methods(comparison),
-        "dimension_horizon.png": lambda: plots.draw_dimension_horizon(comparison),
         "chunks.png": chunks,
     }
 
@@ -84,30 +74,20 @@ def pictures(comparison: Comparison, predictions: Predictions, store: Any) -> di
 def test_every_picture_is_written(tmp_path, episodes, dimensions, constant, horizon):
     shown = evaluated(episodes, dimensions, constant=constant, horizon=horizon)
     files = write(tmp_path, pictures(*shown))
-    assert len(files) == 5 and all(file.stat().st_size > 5000 for file in files)
+    assert len(files) == 3 and all(file.stat().st_size > 5000 for file in files)
 
 
-def test_whole_chunks_are_drawn_at_their_instants_with_and_without_frames() -> None:
+def test_whole_chunks_are_drawn_at_their_instants() -> None:
     comparison, predictions, store = evaluated(2)
     figure = pictures(comparison, predictions, store)["chunks.png"]()
-    courses = figure.axes[4:]  # below two views of two instants
-    assert len(courses) == 4
-    for axis, dimension in zip(courses, range(4), strict=True):
+    for axis, dimension in zip(figure.axes, range(4), strict=True):
         whole = [line for line in axis.lines if len(line.get_xdata()) == 3]
         assert [line.get_xdata()[0] for line in whole] == pytest.approx([0.0, 0.6])
         np.testing.assert_array_equal(whole[1].get_ydata(), predictions.predicted[6, :, dimension])
     episode: Any = store.episodes[1]
-    last: Any = plots.draw_chunks(comparison, predictions, store, episode, np.array([23]), {})  # type: ignore[arg-type]
+    last: Any = plots.draw_chunks(comparison, predictions, store, episode, np.array([23]))
     assert len(last.axes) == 4, "a chunk ends with its episode"
     assert [1.1] in [pytest.approx(line.get_xdata()) for line in last.axes[0].lines]
-
-
-def test_errors_by_dimension_and_step_are_in_training_deviations() -> None:
-    comparison, *_ = evaluated(2)
-    comparison = replace(comparison, scale=np.array([0.5, 1, 1, 2, 0.0]))
-    (axis, _) = plots.draw_dimension_horizon(comparison).axes
-    errors = comparison.scores["policy"].mae_horizon[:, :4] / [0.5, 1, 1, 2]
-    np.testing.assert_allclose(np.asarray(axis.images[0].get_array()), errors.T)
 
 
 def test_methods_are_bars_with_whiskers_and_steps_have_bands_where_groups_are_two() -> None:
@@ -120,62 +100,6 @@ def test_methods_are_bars_with_whiskers_and_steps_have_bands_where_groups_are_tw
         (axis,) = plots.draw_horizon(comparison, 10.0).axes
         bands = [path for band in axis.collections for path in band.get_paths()]
         assert bool(bands) == (episodes > 1)
-
-
-def test_curves_mark_the_step_that_was_judged() -> None:
-    steps = np.array([10, 20, 30])
-    known = {"train/loss": [1.0, 0.1, 0.01], "lr": [0.0, 1e-3, 5e-4], "train/other": [1.0] * 3}
-    logged = {name: TrainingCurve(steps, np.array(values)) for name, values in known.items()}
-    figure = plots.draw_curves(TrainingCurves(logged), 20)
-    assert [axis.get_yscale() for axis in figure.axes] == ["log", "linear"]
-    for axis in figure.axes:
-        assert axis.lines[0].get_xdata().tolist() == steps.tolist()
-        assert axis.lines[1].get_xdata()[0] == 20
-    (axis,) = plots.draw_curves(TrainingCurves({"train/other": logged["train/other"]}), 5).axes
-    assert axis.get_title() == "train/other"
-
-
-def test_a_picture_never_writes_through_a_link(tmp_path: Path) -> None:
-    cache, report = tmp_path / "cache.png", tmp_path / "report"
-    report.mkdir()
-    cache.write_bytes(b"cached")
-    (report / "scatter.png").hardlink_to(cache)
-    write(report, {"scatter.png": pictures(*evaluated(1))["scatter.png"]})
-    assert (report / "scatter.png").read_bytes().startswith(b"\x89PNG")
-    assert cache.read_bytes() == b"cached"
-
-
-def studied(*errors: float) -> AblationStudy:
-    """A study whose policy, in the first dimension of two, is wrong by these, intact first."""
-
-    def judged(error: float) -> Comparison:
-        recorded = np.zeros((4, 1, 1), np.float32)
-        ticks = np.arange(4)
-        predictions = Predictions(
-            ticks, ticks // 2, recorded + np.float32(error), recorded, np.ones((4, 1), bool)
-        )
-        rules = {
-            name: np.full((4, 1, 1), wrong, np.float32)
-            for name, wrong in zip(BASELINES, (5, 3, 4, 6, 7), strict=True)
-        }
-        one = (ActionGroup("translation", "mm", (0,)),)
-        return compare(predictions, rules, (("dx",), ("mm",), one, np.ones(1)))
-
-    ways = (("sensor", "zeroed"), ("sensor", "delayed 50 ms"), ("features", "shuffled"))
-    spoilt = tuple(
-        Ablated(stream, how, judged(error), judged(errors[0]))
-        for (stream, how), error in zip(ways, errors[1:], strict=True)
-    )
-    return AblationStudy(judged(errors[0]), spoilt, (), 4)
-
-
-def test_what_each_stream_is_worth_stands_beside_intact_and_best_baseline() -> None:
-    (axis,) = plots.draw_modalities(studied(0.5, 1.0, 0.75, 2.0)).axes
-    assert [patch.get_width() for patch in axis.patches] == [2.0, 1.5, 4.0]
-    levels = [line.get_xdata()[0] for line in axis.lines if line.get_label()[0] != "_"]
-    assert levels == [1.0, 6.0]
-    (axis,) = plots.draw_modalities(studied(0.0, 1.0, 0.0, 2.0)).axes
-    assert not axis.patches, "a policy without error has no multiples"
 
 
 def score(mean: float, spread: float = 0.02) -> ProbeScore:
@@ -210,7 +134,7 @@ def probed(layers: int = 2) -> ProbeStudy:
             ]
     folds = ProbeFolds(np.arange(30), np.arange(30) // 10, np.arange(3)[None], ())
     known = (Known("past actions", 10, score(0.1)), Known("past actions + state", 15, score(0.2)))
-    return ProbeStudy(2, ("dx",), folds, score(-0.01), known, tuple(slots), tuple(groups))
+    return ProbeStudy(2, folds, score(-0.01), known, tuple(slots), tuple(groups))
 
 
 def test_slots_are_a_map_over_layers_and_cells_a_map_a_view() -> None:

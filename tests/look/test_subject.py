@@ -47,12 +47,6 @@ def test_a_store_is_known_by_its_content(tmp_path: Path, tiny_store: Callable[..
     assert subject_of(looking_at(renamed)).store == renamed
 
 
-def test_a_store_is_looked_at_alone(tmp_path: Path, tiny_store: Callable[..., Path]) -> None:
-    one, two = tiny_store(tmp_path, name="one"), tiny_store(tmp_path, name="two")
-    assert f"Look at it alone: python -m stages.inspect {one}" in refused(one, two)
-    assert f"python -m stages.inspect {one}" in refused(tmp_path / "*.zarr")
-
-
 def test_every_path_has_a_folder_of_its_own(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for place in ("lab/day 1/run", "lab/day2/run"):
@@ -73,19 +67,3 @@ def test_every_path_has_a_folder_of_its_own(tmp_path, monkeypatch):
     for place in ("데이터", "실험"):
         (tmp_path / place).mkdir()
         assert subject_of(looking_at(place)).folder == Path("reports/inspect", place)
-
-
-def test_a_page_that_could_not_be_written_is_refused_first(tmp_path, tiny_store, monkeypatch):
-    def refusal(output: Path) -> str:
-        with pytest.raises(ConfigError, match=r"--set inspect\.output=FOLDER") as caught:
-            subject_of(looking_at(tmp_path, output=output))
-        return str(caught.value)
-
-    (tmp_path / "file").write_bytes(b"")
-    for output in (tmp_path / "file", tmp_path / "file" / "in it"):
-        assert f"found the file {tmp_path / 'file'}" in refusal(output)
-    with pytest.raises(ConfigError, match=r"inspect\.output: must not lie inside a store"):
-        looking_at(tmp_path, output=tiny_store(tmp_path) / "page")
-    # Permissions do not bind root, whom tests may run as.
-    monkeypatch.setattr("os.access", lambda path, mode: path != tmp_path)
-    assert f"{tmp_path} cannot be written to" in refusal(tmp_path / "new")

@@ -17,7 +17,6 @@ from pipeline.base.errors import RecordingError
 from pipeline.data import Recording, open_recordings
 from pipeline.data.insertion import SENSOR, STATE
 from pipeline.extract import extract
-from pipeline.look.robot_run import compare_keys
 from pipeline.robot import recorder as recorder_module
 from pipeline.robot.recorder import RunRecorder, encode_png, recover
 from pipeline.simulation.environment import InsertionEnvironment
@@ -158,7 +157,7 @@ def test_a_run_comes_back_as_it_was_and_says_how_it_ended(run) -> None:
 
 
 def test_a_store_of_a_run_has_its_actions_its_clocks_and_the_robots_keys(run) -> None:
-    driven, path, store = run
+    driven, _, store = run
     start = driven.time[0]
     np.testing.assert_array_equal(store.array("tick/action"), np.stack(driven.sent))
     np.testing.assert_allclose(store.array("tick/time"), np.array(driven.time) - start, atol=1e-9)
@@ -167,8 +166,6 @@ def test_a_store_of_a_run_has_its_actions_its_clocks_and_the_robots_keys(run) ->
     captured = [[frames[view][0] - start for view in VIEWS] for _, frames, _ in driven.looked]
     np.testing.assert_array_equal(store.array("vl/frame_time"), captured)
     assert len(np.concatenate(driven.readings["state"])) == len(store.array("state/values"))
-    same = f"{len(keys)} of {len(keys)} VL rows have a key of the robot's"
-    assert compare_keys(path, store) == same
 
 
 def observed_at(tick: int, **readings: Any) -> dict[str, Any]:

@@ -101,9 +101,6 @@ def test_a_table_for_each_span_a_file_and_a_picture(experiments: Path, capsys: S
         assert row["seeds"] == "0"
     page = (output / "report.html").read_text()
     assert all(name in page for name in NAMES)
-    markdown = (experiments.parent / "comparison.md").read_text().splitlines()
-    assert markdown[1].startswith("| --- |")
-    assert len({line.count("|") for line in markdown if line}) == 1
 
 
 def test_seeds_become_one_row(experiments: Path) -> None:

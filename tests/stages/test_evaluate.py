@@ -17,16 +17,7 @@ from stages import evaluate, train_head
 from stages.command import run
 
 ROOT = Path(__file__).resolve().parents[2]
-PICTURES = (
-    "curves",
-    "dimension_horizon",
-    "episode_worst",
-    "horizon",
-    "methods",
-    "modalities",
-    "scatter",
-)
-"""Of one test episode, which is the worst, and of which dvc.yaml lists some."""
+PICTURES = ("episode_worst", "horizon", "methods")
 
 
 @pytest.fixture(scope="module")
@@ -123,10 +114,10 @@ def test_a_policy_outlives_the_renaming_of_its_source(trained_tiny, judged, tmp_
 
 
 def test_the_report_says_what_was_judged_and_which_streams_are_used(judged):
-    """One test episode: nothing can be shuffled or drawn anew, and the report says so."""
+    """One test episode: nothing can be drawn anew, and the report says so."""
     report, said = judged
     assert "sensor    zeroed" in said
-    assert "sensor shuffled: not judged" in said and "intervals take at least two" in said
+    assert "intervals take at least two" in said
     for name in PICTURES:
         assert (report / f"{name}.png").read_bytes().startswith(b"\x89PNG")
     assert "\nsensor delayed 50 ms," in (report / "streams.csv").read_text()
@@ -137,9 +128,6 @@ def test_the_report_says_what_was_judged_and_which_streams_are_used(judged):
     name, tested = next(iter(document["on"]["test"].items()))
     assert tested["ticks"] == [0, 30] and tested["group"] == name
     assert document["on"]["execute"] == 1
-    place = f"data/demo/recordings/{name.split('/')[1]}"
-    page = (report / "report.html").read_text()
-    assert f"No frames: there is no recording at {place} any more." in page
 
 
 def test_the_same_judgement_is_the_same_bytes_wherever_it_is_written(
@@ -154,26 +142,13 @@ def test_the_same_judgement_is_the_same_bytes_wherever_it_is_written(
     assert first == second and "report.html" in first
 
 
-def test_a_report_says_that_the_logs_are_gone(trained_tiny, tmp_path, reports):
-    logs = shutil.move(trained_tiny.parent / "logs", tmp_path / "logs")
-    try:
-        assert run("", evaluate.main, arguments(trained_tiny, tmp_path / "report")) == 0
-    finally:
-        shutil.move(logs, trained_tiny.parent / "logs")
-    (report,) = reports
-    gone = f"there are none in {trained_tiny.parent / 'logs/plots/metrics'} any more"
-    assert any(gone in text.words for text in report.blocks(Text))
-    assert "curves" not in {picture.name for picture in report.blocks(Picture)}
-
-
 def test_streams_are_left_alone_where_nobody_asks(trained_tiny, tmp_path, reports):
     """DVC misses no file of such an evaluation either."""
     listed = re.findall(r"evaluate\.output}/([\w.]+)", (ROOT / "dvc.yaml").read_text())
     output = tmp_path / "report"
     assert run("", evaluate.main, arguments(trained_tiny, output)) == 0
     pictures = {f"{picture.name}.png" for picture in reports[0].blocks(Picture)}
-    assert len(listed) > 8 and set(listed) <= pictures | {file.name for file in output.iterdir()}
-    assert "modalities.png" not in pictures
+    assert len(listed) > 4 and set(listed) <= pictures | {file.name for file in output.iterdir()}
     assert (output / "streams.csv").read_text().count("\n") == 1
 
 

@@ -48,7 +48,7 @@ class EvaluateParams(Section):
     """Steps of a chunk that the robot executes before it requests the next; their error comes
     first."""
     modalities: bool = True
-    """Also evaluate with each stream zeroed, shuffled across episodes and delayed."""
+    """Also evaluate with each stream at its training mean, and delayed."""
     device: str = "auto"
     """auto, cpu, cuda or cuda:N."""
     store: Place | None = None

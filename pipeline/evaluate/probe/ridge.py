@@ -136,14 +136,6 @@ class ProbeScore:
     """(repeat, fold): the penalty of the inputs, chosen on the other folds."""
 
     @property
-    def by_target(self) -> NDArray[np.float64]:
-        """(target,) R^2 over all held-out rows: 1 - PRESS / total sum of squares (Allen 1974).
-
-        It is the mean over the deals.
-        """
-        return 1 - self.losses.mean(axis=0).sum(axis=0) / self.rows.sum()
-
-    @property
     def explained(self) -> NDArray[np.float64]:
         """(repeat, group): R^2 times ticks, the mean over the targets that vary."""
         return self.rows - np.nanmean(self.losses, axis=2)

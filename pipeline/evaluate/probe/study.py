@@ -89,7 +89,6 @@ class ProbeStudy:
     """All results, and the baselines beside them."""
 
     horizon: int
-    action_names: tuple[str, ...]
     folds: ProbeFolds
     mean_action: ProbeScore
     known: tuple[Known, ...]
@@ -220,7 +219,6 @@ def probe(store: FeatureStore, params: ProbeParams) -> ProbeStudy:
         codecs = tuple(tqdm(judged, "codecs", len(pairs), leave=False, disable=None))
     return ProbeStudy(
         horizon=params.horizon,
-        action_names=tuple(store.streams["action"]["names"]),
         folds=folds,
         mean_action=mean_action,
         known=tuple(known),

@@ -15,16 +15,12 @@ TOP = 12
 
 
 def write_tables(folder: Path, study: ProbeStudy) -> list[Path]:
-    """Write metrics.json, slots.csv and groups.csv, the best first, and targets.csv.
-
-    targets.csv has R^2 by channel and step of the chunk, for the baseline and for each group.
-    """
+    """Write metrics.json, and slots.csv and groups.csv, the best first; return their paths."""
     of_groups = ("slots", "channels", "inputs", "row_bytes")
     slots = [_row(study, result) for result in ranked(study.slots)]
     tables = {
         "slots.csv": [{k: v for k, v in row.items() if k not in of_groups} for row in slots],
         "groups.csv": [_row(study, result) for result in ranked(study.groups)],
-        "targets.csv": _target_rows(study),
     }
     tables = {name: rows for name, rows in tables.items() if rows}  # slots may be too many
     write_document(folder / "metrics.json", metrics(study))
@@ -185,16 +181,3 @@ def _row(study: ProbeStudy, result: ProbeResult) -> dict[str, Any]:
     for reading, score in scores.items():
         row[f"penalty_{reading}"] = float(np.median(score.penalties))
     return row
-
-
-def _target_rows(study: ProbeStudy) -> list[dict[str, Any]]:
-    """Lines of targets.csv."""
-    targets = [(step + 1, name) for step in range(study.horizon) for name in study.action_names]
-    rows: list[dict[str, Any]] = []
-    for result in ranked(study.groups):
-        named = {head: _row(study, result)[head] for head in ("layer", "norm", "pooling")}
-        scores = {"alone": result.alone, "beside": result.beside, "known": study.baseline.score}
-        for index, (step, channel) in enumerate(targets):
-            r2 = {f"r2_{reading}": score.by_target[index] for reading, score in scores.items()}
-            rows.append({**named, "step": step, "channel": channel, **r2})
-    return rows

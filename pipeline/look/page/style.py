@@ -8,9 +8,7 @@ replaces these by its own colours, in light and in dark.
 import base64
 import io
 import re
-import warnings
-from collections.abc import Callable, Generator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -23,11 +21,8 @@ from matplotlib.colors import Colormap
 from matplotlib.figure import Figure
 from matplotlib.gridspec import GridSpec
 from matplotlib.image import AxesImage
-from matplotlib.ticker import NullFormatter, StrMethodFormatter
 from numpy.typing import NDArray
 from PIL import Image
-
-from pipeline.base.files import disk_full_named, fresh
 
 INK = "#333333"
 """Text, axes, and everything else that is black on white paper."""
@@ -41,11 +36,6 @@ _CJK = (
     *("Apple SD Gothic Neo", "Hiragino Sans", "PingFang SC"),
 )
 """Fonts of Debian, Windows and macOS that have Chinese, Japanese and Korean letters."""
-NO_FONT = (
-    "PNG files show boxes for letters that no font of this machine has. Install one that has them, "
-    "as fonts-noto-cjk of Debian and Ubuntu has Chinese, Japanese and Korean."
-)
-_NO_GLYPH = re.compile(rf"Glyph \d+ |{re.escape(NO_FONT)}")
 RASTER_DPI = 144
 """Resolution of bitmaps inside the SVG."""
 POINTS_INCH, POINT_PX = 72, 96 / 72
@@ -60,12 +50,6 @@ COLOURS = {INK: "ink", "#000000": "ink", GRID: "grid", PALETTE[0]: "blue"}
 
 def families() -> list[str]:
     """The fonts of this machine in which matplotlib looks for letters, in this order."""
-    if not set(_CJK) & set(font_manager.get_font_names()):
-        # Matplotlib caches its list of fonts, which may be older than a font.
-        listed = {font.fname for font in font_manager.fontManager.ttflist}
-        for path in sorted(set(font_manager.findSystemFonts()) - listed):
-            with suppress(OSError, RuntimeError, ValueError, KeyError):
-                font_manager.fontManager.addfont(path)
     here = set(font_manager.get_font_names())
     return ["DejaVu Sans", *(name for name in _CJK if name in here)]
 
@@ -91,37 +75,12 @@ RC: dict[Any, Any] = {
 
 
 def write(folder: Path, pictures: Mapping[str, Callable[[], Figure]]) -> list[Path]:
-    """Draw each picture in the common style, save it by its name and return the paths.
-
-    Warns once, with `NO_FONT`, if letters cannot be drawn. Raises `DiskFull`.
-    """
-    with mpl.rc_context(RC), boxes() as notes:
+    """Draw each picture in the common style, save it by its name and return the paths."""
+    with mpl.rc_context(RC):
         for name, draw in pictures.items():
-            figure = draw()
             # Without its `Software` entry the file does not change with matplotlib's version.
-            with disk_full_named(folder):
-                figure.savefig(fresh(folder / name), dpi=120, metadata={"Software": None})
-    if notes:
-        warnings.warn(NO_FONT, stacklevel=2)
+            draw().savefig(folder / name, dpi=120, metadata={"Software": None})
     return [folder / name for name in pictures]
-
-
-@contextmanager
-def boxes() -> Generator[set[str]]:
-    """Yields a set that gets `NO_FONT` if a letter is drawn as a box; hides those warnings."""
-    notes: set[str] = set()
-    show = warnings.showwarning
-
-    def note(message: Warning | str, *where: Any, **more: Any) -> None:
-        if _NO_GLYPH.match(str(message)):
-            notes.add(NO_FONT)
-        else:
-            show(message, *where, **more)
-
-    with warnings.catch_warnings():
-        warnings.filterwarnings("always", _NO_GLYPH.pattern, UserWarning)
-        warnings.showwarning = note
-        yield notes
 
 
 def canvas(width: float, height: float) -> Figure:
@@ -185,13 +144,6 @@ def draw_strip(
             axis.images[0].set_gid(f"frame-{row}-{column}")
             axis.set_ylabel("" if column else view)
             axis.set_title("" if row else f"{times_s[column]:.1f} s")
-
-
-def logarithmic(axis: Axes) -> None:
-    """Make the y axis logarithmic, with plain numbers: matplotlib's own labels are TeX."""
-    axis.set_yscale("log")
-    axis.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
-    axis.yaxis.set_minor_formatter(NullFormatter())
 
 
 def finish(figure: Figure, axis: Axes, columns: int, title: str | None = None) -> None:

@@ -36,7 +36,7 @@ from pipeline.look.page.blocks import (
     place_of,
     places_of,
 )
-from pipeline.look.page.style import NO_FONT, RC, boxes, inline_svg, write
+from pipeline.look.page.style import RC, inline_svg, write
 
 PAGE = "report.html"
 OPEN_GROUPS = 12
@@ -116,13 +116,13 @@ class _PageWriter:
     def html(self, report: Report, pictures: Sequence[str]) -> str:
         """The whole page, after its pictures were written."""
         bar = tqdm(total=len(pictures), desc="pictures", unit="", disable=None)
-        with bar as self._bar, boxes() as notes:
+        with bar as self._bar, mpl.rc_context(RC), warnings.catch_warnings():
+            # Where this machine has no font for a letter, PNG files show a box; the page does not.
+            warnings.filterwarnings("ignore", r"Glyph \d+ ", UserWarning)
             sections = [self._section(section) for section in report.sections]
-        if notes:
-            warnings.warn(NO_FONT, stacklevel=3)
         page = self._jinja.get_template("page.html")
         names = " ".join(pictures)
-        return page.render(report=report, notes=notes, sections=sections, pictures=names)
+        return page.render(report=report, sections=sections, pictures=names)
 
     def _section(self, section: Section) -> dict[str, Any]:
         return {
@@ -144,10 +144,9 @@ class _PageWriter:
 
     def _draw(self, picture: Picture) -> Markup:
         """The picture as SVG; the same figure is written as PNG."""
-        with mpl.rc_context(RC):
-            figure = picture.draw()
-            write(self._folder, {f"{picture.name}.png": lambda: figure})
-            svg = inline_svg(figure, picture.name, picture.caption)
+        figure = picture.draw()
+        write(self._folder, {f"{picture.name}.png": lambda: figure})
+        svg = inline_svg(figure, picture.name, picture.caption)
         self._bar.update()
         return Markup(svg)
 

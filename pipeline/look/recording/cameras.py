@@ -2,16 +2,13 @@
 
 A long episode costs no more than a short one:
 - JPEG files: all are compared for duplicates (equal bytes are equal pictures); every frame that a
-  VL row sees is decoded at an eighth of its size, as extraction does, and checked for one colour;
-  `RUNS` pairs of neighbours, evenly spread, are decoded whole.
+  VL row sees is decoded at an eighth of its size, as extraction does, and checked for one colour.
 - Videos and pictures in rows: all frames of an episode of up to `MOST_FRAMES`, else `RUNS` runs of
   neighbours, evenly spread. The packets of a whole video are read in any case.
 
-Equal pictures prove a frozen camera only if its pictures have noise: if most pixels differ between
-neighbours, also just before and after equal ones. The pictures of a simulation, and of a video
-whose encoder skips what stands still, are equal whenever nothing moves. Such a camera counts as
-frozen if every other camera of the episode sees something move meanwhile; a single camera counts as
-frozen only if it never changes at all.
+The pictures of a simulation, and of a video whose encoder skips what stands still, are equal
+whenever nothing moves. So a camera counts as frozen only if every other camera of the episode sees
+something move meanwhile, or if it never changes at all.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -32,15 +29,9 @@ from pipeline.look.recording.episode import BROKEN, Draw, EpisodeView, runs
 MOST_FRAMES, RUNS = 120, 12
 # Standard deviation of the colour that varies most, of 255, up to which a frame shows nothing.
 ONE_COLOUR = 2.0
-# Equal pairs in a row that are a freeze of a camera with noise, and the share of all pairs from
-# which single equal pairs are an issue.
-DUPLICATES, DUPLICATE_SHARE = 3, 0.1
-# The same for a camera without noise: equal pairs in a row, and the least number of differing pairs
-# that every other view has meanwhile.
+# Equal pairs in a row that are a freeze, and the least number of differing pairs that every other
+# view has meanwhile.
 STILL_PAIRS, MOVING_PAIRS = 5, 20
-# Share of the pixels that differ between neighbours where pictures have noise, at least in nine of
-# ten pairs.
-NOISY = 0.3
 _COLUMN_IN = 2.3
 
 
@@ -119,7 +110,6 @@ class _Compared:
     index: NDArray[np.int64]
     equal: NDArray[np.bool_]
     blank: dict[int, bool]
-    noisy: bool
 
 
 def find_frame_issues(view: EpisodeView) -> Iterator[Issue]:
@@ -132,57 +122,37 @@ def find_frame_issues(view: EpisodeView) -> Iterator[Issue]:
             yield view.issue("unreadable", f"view {name}", str(error), severity="error")
     for name, own in compared.items():
         yield from _dead(view, name, own.blank)
-        if not all(own.blank.values()):
+        if not any(own.blank.values()):
             yield from _duplicates(view, name, compared)
 
 
 def _compare(view: EpisodeView, name: str, camera: CameraStream) -> _Compared:
-    count, repeats = len(camera.time), camera.repeats()
-    blank: dict[int, bool] = {}
-    if repeats is not None and view.timeline is not None:
+    count, equal = len(camera.time), camera.repeats()
+    if equal is not None and view.timeline is not None:
         served = np.unique(view.timeline.frames[name]).tolist()
         if (thumbnails := camera.check(served)) is not None:
             blank = dict(zip(served, map(_is_blank, thumbnails), strict=True))
-    index = _spread_runs(count, MOST_FRAMES if repeats is None else 2 * RUNS)
-    check_all, shares = not blank, list[float]()
+            return _Compared(np.arange(count), equal, blank)
+    index = _spread_runs(count)
+    blank, repeats = dict[int, bool](), list[bool]()
     before: NDArray[np.uint8] | None = None
     for number, frame in zip(index.tolist(), camera.read(index.tolist()), strict=True):
-        if check_all:
-            blank[number] = _is_blank(frame)
+        blank[number] = _is_blank(frame)
         if before is not None:
-            shares.append(_share_differing(before, frame))
+            repeats.append(np.array_equal(before, frame))
         before = frame
-    differing = np.array(shares)
-    neighbours = differing[(differing > 0) & (np.diff(index) == 1)]
-    noisy = len(neighbours) > 0 and float(np.percentile(neighbours, 10)) > NOISY
-    if repeats is None:
-        return _Compared(index, differing == 0, blank, noisy)
-    noisy = noisy and all(share > NOISY for share in _beside(camera, repeats))
-    return _Compared(np.arange(count), repeats, blank, noisy)
+    return _Compared(index, np.array(repeats, np.bool_), blank)
 
 
 def _is_blank(frame: NDArray[np.uint8]) -> bool:
     return bool(frame.std(axis=(0, 1)).max() <= ONE_COLOUR)
 
 
-def _share_differing(before: NDArray[np.uint8], after: NDArray[np.uint8]) -> float:
-    """Share of pixels that differ; 1 if the sizes differ."""
-    return float((before != after).any(axis=2).mean()) if before.shape == after.shape else 1.0
-
-
-def _beside(camera: CameraStream, equal: NDArray[np.bool_]) -> Iterator[float]:
-    """Share of pixels that differ just before and just after the longest runs of equal pairs."""
-    for first, last in sorted(runs(equal), key=lambda run: run[0] - run[1])[:RUNS]:
-        for place in (first - 1, last):
-            if 0 <= place < len(equal):
-                yield _share_differing(*camera.read([place, place + 1]))
-
-
-def _spread_runs(frames: int, most: int) -> NDArray[np.int64]:
-    """All frames if they are at most `most`, else `RUNS` runs of neighbours, evenly spread."""
-    if frames <= most:
+def _spread_runs(frames: int) -> NDArray[np.int64]:
+    """All of at most `MOST_FRAMES` frames, else `RUNS` runs of neighbours, evenly spread."""
+    if frames <= MOST_FRAMES:
         return np.arange(frames)
-    length = most // RUNS
+    length = MOST_FRAMES // RUNS
     starts = np.linspace(0, frames - length, RUNS).astype(np.int64)
     return np.unique(starts[:, None] + np.arange(length))
 
@@ -190,40 +160,28 @@ def _spread_runs(frames: int, most: int) -> NDArray[np.int64]:
 def _dead(view: EpisodeView, name: str, blank: Mapping[int, bool]) -> Iterator[Issue]:
     time, frames = view.cameras[name].time, list(blank)
     for first, stop in runs(np.array(list(blank.values()), np.bool_)):
-        if stop - first == len(frames):
-            message, span = f"all {len(frames)} frames looked at are of one colour", ()
-        else:
-            start, last = frames[first], frames[stop - 1]
-            message = f"frames {start} to {last}, {stop - first} of the {len(frames)} looked at, "
-            message, span = f"{message}are of one colour", (float(time[start]), float(time[last]))
+        start, last = frames[first], frames[stop - 1]
+        message = (
+            f"frames {start} to {last}, {stop - first} of the {len(frames)} looked at, are of one "
+            "colour"
+        )
+        span = float(time[start]), float(time[last])
         yield view.issue("dead camera", f"view {name}", message, *span)
 
 
 def _duplicates(view: EpisodeView, name: str, compared: Mapping[str, _Compared]) -> Iterator[Issue]:
     own, kind, stream = compared[name], "duplicate frames", f"view {name}"
-    pairs = len(own.equal)
-    if pairs >= STILL_PAIRS and own.equal.all():
-        message = f"all {pairs + 1} frames looked at are one picture; expected a running camera"
+    if len(own.equal) >= STILL_PAIRS and own.equal.all():
+        message = f"all {len(own.index)} frames looked at are one picture; expected a moving one"
         yield view.issue(kind, stream, message)
         return
-    time, single = view.cameras[name].time, own.equal.copy()
-    dead = [number for number, blank in own.blank.items() if blank]
+    time = view.cameras[name].time
     for first, last in runs(own.equal):
         start, stop = own.index[[first, last]].tolist()
-        if any(start <= number <= stop for number in dead):  # an issue of its own
-            single[first:last] = False
-            continue
         span = float(time[start]), float(time[stop])
-        long = last - first >= (DUPLICATES if own.noisy else STILL_PAIRS)
-        if long and (own.noisy or _others_move(view, name, compared, *span)):
-            single[first:last] = False
-            why = "elsewhere frames differ" if own.noisy else "other views move"
-            message = f"frames {start} to {stop} are one picture; {why}"
+        if last - first >= STILL_PAIRS and _others_move(view, name, compared, *span):
+            message = f"frames {start} to {stop} are one picture, while other views move"
             yield view.issue(kind, stream, message, *span)
-    again = time[own.index[1:][single]]
-    if own.noisy and len(again) >= DUPLICATES and len(again) > DUPLICATE_SHARE * pairs:
-        message = f"{len(again)} of {pairs} frames compared are the picture before"
-        yield view.issue(kind, stream, message, *again[[0, -1]].tolist())
 
 
 def _others_move(

@@ -20,7 +20,7 @@ from pipeline.base.errors import Issue
 from pipeline.base.text import Table
 from pipeline.data.timeline import Timeline
 from pipeline.look.page.blocks import Block
-from pipeline.look.page.style import GRID, INK, PALETTE, panels
+from pipeline.look.page.style import INK, PALETTE, panels
 from pipeline.look.recording.episode import Draw, EpisodeView
 
 # A step of so many usual steps or more is a gap.
@@ -30,9 +30,6 @@ DROPPED_STEP = 1.5
 # Least number of such steps, and the share of all steps that they must exceed. The frames for which
 # there was time must exceed it too: jitter alone leaves no time, as it also makes steps shorter.
 DROPPED, DROPPED_SHARE = 5, 0.05
-# How late a stream may begin, or how early end: the smaller of seconds and a share of the episode,
-# but at least so many ticks and `DROPPED_STEP` of its own steps.
-LOST_S, LOST_SHARE, LOST_TICKS = 0.5, 0.05, 2.5
 
 # If the median step is below this share of the mean step, entries are stamped in bursts.
 _BURSTS = 0.5
@@ -48,10 +45,8 @@ _FEWEST = 20
 _GAP_COLOUR = "#D55E00"
 # Colour of a stroke, in the order of the lanes: a lane is below those that feed it.
 _KINDS = {"stream": PALETTE[4], "camera": PALETTE[0], "vl_row": PALETTE[2], "tick": INK}
-# A lane has room for so many strokes: of entries that are nearer, only one is drawn.
-_STROKES = 1500
-# VL rows in the lower picture, and its seconds if there are none.
-_ROWS_NEAR, _NEAR_S = 5, 1.5
+# VL rows in the picture, and its seconds if there are none.
+_ROWS, _SPAN_S = 5, 1.5
 # How far the marks of a lane reach up and down.
 _HALF = 0.36
 
@@ -165,7 +160,7 @@ def _merge_equal(clocks: Iterable[Clock]) -> list[Clock]:
 
 
 def find_clock_issues(view: EpisodeView) -> Iterator[Issue]:
-    """Issues of kind gap, repeated times, dropped frames and lost ticks.
+    """Issues of kind gap, repeated times and dropped frames.
 
     A gap shorter than a tick is no issue: no tick loses a reading by it.
     """
@@ -182,7 +177,6 @@ def find_clock_issues(view: EpisodeView) -> Iterator[Issue]:
             yield view.issue("repeated times", clock.name, message)
         if clock.kind == "camera":
             yield from _dropped(view, clock)
-    yield from _lost_ticks(view, recorded)
 
 
 def _dropped(view: EpisodeView, clock: Clock) -> Iterator[Issue]:
@@ -206,30 +200,6 @@ def _dropped(view: EpisodeView, clock: Clock) -> Iterator[Issue]:
     yield view.issue("dropped frames", clock.name, message, *span)
 
 
-def _lost_ticks(view: EpisodeView, recorded: Sequence[Clock]) -> Iterator[Issue]:
-    """A stream that begins after most of the others or ends before most of them."""
-    # A clock that was set during the recording has a gap, and cannot say when its stream ended.
-    clocks = [c for c in recorded if all(gap.length_s < LOST_S for gap in c.gaps)]
-    if len(clocks) < 2:
-        return
-    middle, tick_s = (len(clocks) - 1) // 2, _tick_s(view)
-    least_s = max(LOST_TICKS * tick_s, min(LOST_S, LOST_SHARE * view.duration_s))
-    for place, sign, words in ((0, 1, "begins {:.2f} s after"), (-1, -1, "ends {:.2f} s before")):
-        # The later, the further into the episode, from its start or back from its stop.
-        inward = [sign * float(clock.time[place]) for clock in clocks]
-        extreme, usual = max(inward), sorted(inward)[middle]
-        lost_s = extreme - usual
-        near_s = min(LOST_S, lost_s) / 2
-        late = [c for c, at in zip(clocks, inward, strict=True) if extreme - at <= near_s]
-        if lost_s > max(least_s, *(DROPPED_STEP * clock.step_s for clock in late)):
-            share = 100 * lost_s / view.duration_s
-            cost = f"about {lost_s / tick_s:.0f} ticks, {share:.0f} % of the episode"
-            message = f"{words.format(lost_s)} most others, which costs {cost}"
-            names = ", ".join(clock.name for clock in late)
-            span = sorted((sign * usual, sign * extreme))
-            yield view.issue("lost ticks", names, message, *span)
-
-
 def _tick_s(view: EpisodeView) -> float:
     line = view.timeline
     return _TICK_S if line is None or len(line.time) < 2 else usual_step(line.time)
@@ -241,8 +211,8 @@ def clock_blocks(view: EpisodeView, draw: Draw, params: Params) -> list[Block]:
     if not clocks:
         return []
     caption = (
-        "When each stream was sampled; hatched boxes are gaps. Lines lead from frames to the VL "
-        "row that took them, and from there to the ticks that reuse it."
+        "When each stream was sampled, around the first gap, if any (hatched). Lines lead from "
+        "frames to the VL row that took them, and from there to the ticks that reuse it."
     )
     return [draw("clocks", caption, draw_lanes), clock_table(view, clocks)]
 
@@ -264,58 +234,47 @@ def clock_table(view: EpisodeView, clocks: Sequence[Clock]) -> Table:
 
 
 def draw_lanes(view: EpisodeView) -> Figure:
-    """A lane for each clock: the whole episode above, about five VL rows below.
+    """A lane for each clock, over about five VL rows.
 
-    In the lower picture, lines lead from each frame to the VL row that took it, and from the row to
-    the ticks that reuse it. Streams with exactly the same times share a lane.
+    Lines lead from each frame to the VL row that took it, and from the row to the ticks that reuse
+    it. Streams with exactly the same times share a lane.
     """
     recorded = [clock for clock in read_clocks(view) if len(clock.time)]
     streams = _merge_equal(clock for clock in recorded if clock.kind == "stream")
     clocks = [*streams, *(clock for clock in recorded if clock.kind != "stream")]
     clocks.sort(key=lambda clock: [*_KINDS].index(clock.kind))
-    start = min(float(clock.time[0]) for clock in clocks)
-    stop = max(float(clock.time[-1]) for clock in clocks)
-    near = _choose_near(view, clocks, start, stop)
-    room = 0.01 * max(stop - start, 1e-3)
-    heights = [0.34 * len(clocks) + 0.3, 0.46 * len(clocks) + 0.5]
-    figure, (whole, detail) = panels(11.0, sum(heights) + 0.9, 2, 1, height_ratios=heights)
-    for axis, span in ((whole, (start - room, stop + room)), (detail, near)):
-        axis.set_xlim(span[0] - view.zero, span[1] - view.zero)
-        for lane, clock in enumerate(clocks):
-            _draw_lane(axis, clock, lane, view.zero)
-        axis.set_yticks(range(len(clocks)), [clock.name for clock in clocks])
-        axis.set_ylim(len(clocks) - 0.2, -0.7)
-    whole.axvspan(near[0] - view.zero, near[1] - view.zero, color=GRID, lw=0, zorder=0.3)
-    whole.set_title("the whole episode", loc="left", fontsize=10)
+    start, stop = _choose_span(view, clocks)
+    figure, axis = panels(11.0, 0.46 * len(clocks) + 1.4)
+    axis.set_xlim(start - view.zero, stop - view.zero)
+    for lane, clock in enumerate(clocks):
+        _draw_lane(axis, clock, lane, view.zero)
+    axis.set_yticks(range(len(clocks)), [clock.name for clock in clocks])
+    axis.set_ylim(len(clocks) - 0.2, -0.7)
     if view.timeline is not None:
         lanes = {clock.name: lane for lane, clock in enumerate(clocks)}
-        _draw_reuse(detail, view.timeline, view.zero, lanes, near)
-    detail.set_title(f"the grey part: {near[1] - near[0]:.2f} s", loc="left", fontsize=10)
-    detail.set_xlabel("time since the recording began [s]")
+        _draw_reuse(axis, view.timeline, view.zero, lanes, (start, stop))
+    axis.set_xlabel("time since the recording began [s]")
     return figure
 
 
-def _choose_near(
-    view: EpisodeView, clocks: Sequence[Clock], start: float, stop: float
-) -> tuple[float, float]:
-    """Start and stop in s of the lower picture: five VL rows, around the first gap if any."""
+def _choose_span(view: EpisodeView, clocks: Sequence[Clock]) -> tuple[float, float]:
+    """Start and stop in s of the picture: five VL rows, around the first gap if any."""
+    start = min(float(clock.time[0]) for clock in clocks)
+    stop = max(float(clock.time[-1]) for clock in clocks)
     line = view.timeline
     step = float("nan") if line is None else usual_step(line.vl_time)
-    width = min(_ROWS_NEAR * step if step > 0 else _NEAR_S, max(stop - start, 1e-3))
+    width = min(_ROWS * step if step > 0 else _SPAN_S, max(stop - start, 1e-3))
     gaps = [gap.start_s - width / 4 for clock in clocks for gap in clock.gaps]
     begin = max(min([*gaps, (start + stop - width) / 2][0], stop - width), start)
     return begin, begin + width
 
 
 def _draw_lane(axis: Axes, clock: Clock, lane: int, zero: float) -> None:
-    """Draw a stroke for each entry, as far as there is room, and the gaps."""
+    """Draw a stroke for each entry, and the gaps."""
     low, high = axis.get_xlim()
     time = clock.time[(clock.time >= low + zero) & (clock.time <= high + zero)] - zero
-    places = ((time - low) / (high - low) * _STROKES).astype(np.int64)
-    time = time[np.unique(places, return_index=True)[1]]
     axis.vlines(time, lane - _HALF, lane + _HALF, colors=_KINDS[clock.kind], lw=1.0)
     spans = [(gap.start_s - zero, gap.length_s) for gap in clock.gaps]
-    # One artist for all: thousands of gaps as patches take many seconds.
     axis.broken_barh(
         spans, (lane - _HALF, 2 * _HALF), facecolor="none", hatch="////", lw=1.4,
         edgecolor=_GAP_COLOUR, hatchcolor=_GAP_COLOUR,
@@ -323,10 +282,10 @@ def _draw_lane(axis: Axes, clock: Clock, lane: int, zero: float) -> None:
 
 
 def _draw_reuse(
-    axis: Axes, line: Timeline, zero: float, lanes: Mapping[str, int], near: tuple[float, float]
+    axis: Axes, line: Timeline, zero: float, lanes: Mapping[str, int], span: tuple[float, float]
 ) -> None:
     """Draw lines from frames to the VL rows that took them, and from these to their ticks."""
-    ticks = np.flatnonzero((line.time >= near[0]) & (line.vl_time[line.vl_row] <= near[1]))
+    ticks = np.flatnonzero((line.time >= span[0]) & (line.vl_time[line.vl_row] <= span[1]))
     rows, row_lane = np.unique(line.vl_row[ticks]), lanes["VL rows"]
     for name, time in line.frame_time.items():
         lane = lanes[f"view {name}"]

@@ -10,7 +10,6 @@ from collections import Counter, defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from hashlib import blake2b
 from pathlib import Path
 
 import numpy as np
@@ -50,10 +49,7 @@ ROWS = 100
 
 @dataclass
 class RecordingSummary:
-    """One recording in a line.
-
-    `counts` are entries by clock (`EpisodeView.clocks`), `digests` are of its motion, by stream.
-    """
+    """One recording in a line; `counts` are entries by clock (`EpisodeView.clocks`)."""
 
     source: str
     episode: str
@@ -64,7 +60,6 @@ class RecordingSummary:
     ticks: int
     vl_rows: int
     counts: Mapping[str, int]
-    digests: Mapping[str, str]
     issues: list[Issue]
 
     @property
@@ -143,7 +138,6 @@ def survey_recordings(opened: Opened, params: Params) -> RecordingsOverview:
             embodiments.append((recording, kind))
             rates.append((recording.source, line.recorded_hz, line.fastest_hz))
     _warn_of_missing(summaries)
-    _warn_of_duplicates(summaries)
     common = list(_not_opened(opened))
     try:
         if embodiments:
@@ -169,7 +163,6 @@ def _summarise(view: EpisodeView) -> RecordingSummary:
         ticks=0 if line is None else len(line.time),
         vl_rows=0 if line is None else len(line.vl_time),
         counts={name: len(time) for name, time in view.clocks.items()},
-        digests=_digest_motion(view),
         issues=list(find_issues(view)),
     )
 
@@ -210,40 +203,6 @@ def _warn_of_missing(summaries: Sequence[RecordingSummary]) -> None:
                 message = "not there; most episodes of this source have it"
                 place = summary.source, summary.episode, ", ".join(lacking)
                 summary.issues.append(_warning("missing", message, *place))
-
-
-def _digest_motion(view: EpisodeView) -> dict[str, str]:
-    """Digests of the values of state and action, or of the sensor without either.
-
-    Streams that never change are left out: they can be equal by chance. Clocks are left out too:
-    two formats give the same rows different times.
-    """
-    motion = {name: view.streams[name] for name in ("state", "action") if name in view.streams}
-    streams = motion or ({} if view.sensor is None else {"sensor": view.sensor})
-    return {
-        name: blake2b(stream.values.tobytes(), digest_size=16).hexdigest()
-        for name, stream in streams.items()
-        if np.ptp(stream.values, axis=0).any()
-    }
-
-
-def _warn_of_duplicates(summaries: Sequence[RecordingSummary]) -> None:
-    """Warn of episodes that have the same values as an earlier one in all streams of both."""
-    firsts: dict[tuple[str, str], list[RecordingSummary]] = defaultdict(list)
-    for summary in summaries:
-        for first in (first for digest in summary.digests.items() for first in firsts[digest]):
-            common = sorted(summary.digests.keys() & first.digests.keys(), reverse=True)
-            if all(summary.digests[name] == first.digests[name] for name in common):
-                source = "" if first.source == summary.source else f"{first.source}/"
-                named = f"{source}{first.episode} ({first.path})"
-                equal = f"all values of {' and '.join(common)} are equal"
-                message = f"the same recording as {named}: {equal}, and nothing else was compared"
-                place = summary.source, summary.episode
-                summary.issues.append(_warning("duplicate recording", message, *place))
-                break
-        else:
-            for digest in summary.digests.items():
-                firsts[digest].append(summary)
 
 
 def _not_opened(opened: Opened) -> Iterator[Issue]:

@@ -30,8 +30,6 @@ _LEAST_COLUMN_IN, _COLUMN_IN, _PANEL_IN = 1.65, 2.5, 1.15
 _SMALL = 8
 # Characters of a title over the whole width.
 _TITLE = 120
-# Least change of width over height that the table of images names.
-_STRETCHED = 0.05
 
 
 @dataclass(frozen=True)
@@ -226,25 +224,14 @@ def show_prompt(view: EpisodeView, vlm: VLMParams, spec: FeatureSpec) -> list[Bl
         (*preparer.describe(token), views.get(place))
         for place, token in enumerate(row.token_ids.tolist())
     ]
-    high, wide = spec.image_size
-    rows: list[tuple[object, ...]] = []
-    for name in starts:
-        recorded = frames[name][0].shape[:2]
-        stretch = describe_stretch(recorded, spec.image_size)
-        rows.append((name, "{} × {}".format(*recorded), f"{high} × {wide}", stretch, size))
-    heads = ("view", "recorded [pixels]", "for the model [pixels]", "stretched", "image tokens")
+    pixels = "{} × {}".format(*spec.image_size)
+    rows = [(name, "{} × {}".format(*frames[name][0].shape), pixels, size) for name in starts]
+    heads = ("view", "recorded [pixels]", "for the model [pixels]", "image tokens")
     return [
         Text(f"{len(tokens):,} tokens, {len(views):,} of images."),
         Tokens(fold_tokens(tokens)),
         Table(heads, rows, "Image tokens by view; sizes are height × width"),
     ]
-
-
-def describe_stretch(recorded: tuple[int, ...], pixels: tuple[int, int]) -> str | None:
-    """How a frame (height, width) is stretched for the model; None for less than a twentieth."""
-    wider = pixels[1] / pixels[0] / (recorded[1] / recorded[0])
-    more = max(wider, 1 / wider) - 1
-    return f"{more:.0%} in {'width' if wider > 1 else 'height'}" if more > _STRETCHED else None
 
 
 def fold_tokens(tokens: Sequence[tuple[str, TokenKind, str | None]]) -> list[TokenRun]:

@@ -23,10 +23,8 @@ from pipeline.data.timeline import last_at
 from pipeline.look.page.blocks import Block
 from pipeline.look.page.style import PALETTE, panels, shorten_middle
 from pipeline.look.recording.clocks import Clock, usual_step
-from pipeline.look.recording.episode import Draw, EpisodeView, runs
+from pipeline.look.recording.episode import Draw, EpisodeView
 
-# A sensor is frozen if all its channels repeat for so long.
-FROZEN_S = 0.5
 # An outlier is so many times farther from its neighbours than 95 % of the entries are, and farther
 # than all others are apart.
 OUTLIER = 20.0
@@ -309,12 +307,10 @@ def describe_channels(values: NDArray[np.floating], columns: Sequence[int]) -> N
 
 
 def find_channel_issues(view: EpisodeView) -> Iterator[Issue]:
-    """Issues of kind flat channel, still channel, frozen, action and state outlier."""
+    """Issues of kind flat channel, still channel, action and state outlier."""
     for name, stream in view.streams.items():
         if name != "poses" and len(stream.time) >= _FEWEST:
             yield from _unmoved(view, name, stream)
-    if view.sensor is not None and len(view.sensor.time) >= _FEWEST:
-        yield from _frozen(view, view.sensor)
     if view.timeline is not None:
         yield from _outliers(view, "action", "tick", view.shown["action"])
     if view.state is not None:
@@ -340,30 +336,6 @@ def _unmoved(view: EpisodeView, name: str, stream: Stream) -> Iterator[Issue]:
             f"of {std[largest]:.2g} at most, where {usual[largest]:.2g} is usual for such channels"
         )
         yield view.issue("still channel", name, message)
-
-
-def _frozen(view: EpisodeView, sensor: Stream) -> Iterator[Issue]:
-    """Spans in which the whole sensor, or all of it except the force, repeats one reading."""
-    force = force_columns(sensor.channels.names)
-    columns = [column for column in range(sensor.values.shape[1]) if column not in force] or force
-    if not np.ptp(sensor.values, axis=0)[columns].any():
-        return  # flat channels throughout
-    what = "all channels" if columns == force or not force else "all channels but the force"
-    for start, stop in runs(_repeats(sensor.values, columns)):
-        begin, end = float(sensor.time[start]), float(sensor.time[stop])
-        if end - begin >= FROZEN_S:
-            message = f"{what} repeat one reading {stop - start + 1} times; elsewhere they change"
-            yield view.issue("frozen", "sensor", message, begin, end)
-
-
-def _repeats(values: NDArray[np.float32], columns: Sequence[int]) -> NDArray[np.bool_]:
-    """(reading - 1,) whether a reading equals the one before, in these columns."""
-    same = np.ones(len(values) - 1, np.bool_)
-    for column in columns:
-        # Compare only where all columns so far repeat: soon there are few such places.
-        places = np.flatnonzero(same)
-        same[places] = values[places, column] == values[places + 1, column]
-    return same
 
 
 def _outliers(view: EpisodeView, name: str, entry: str, stream: Stream) -> Iterator[Issue]:

@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from pipeline.base.channels import named
 from pipeline.base.config import DataParams, Source
 from pipeline.base.errors import Issue
 from pipeline.data import open_recordings
@@ -59,11 +58,9 @@ def test_nothing_is_found_in_a_healthy_recording(healthy: Path, issues_of: Find,
 
 
 def test_little_is_found_in_real_recordings(shared_data: Path, issues_of: Find) -> None:
-    # Composites: half of these views' frames were shown twice, and the tip never moved in z.
-    twice = [("duplicate frames", "view View3"), ("duplicate frames", "view View5")]
     expected = {
-        "raw": [("flat channel", "state"), *twice],
-        "new": [("flat channel", "state"), *twice],
+        "raw": [("flat channel", "state")],
+        "new": [("flat channel", "state")],
         "old": [("flat channel", "action")],
     }
     for format, issues in expected.items():
@@ -72,34 +69,14 @@ def test_little_is_found_in_real_recordings(shared_data: Path, issues_of: Find) 
 
 
 class TestCameras:
-    def test_dead(self, copied: Copied, issues_of: Find) -> None:
-        folder = copied("raw")
-        for path in frames(folder, "View1"):
-            Image.new("RGB", (224, 126)).save(path)
-        (issue,) = issues_of(folder)
-        assert (issue.kind, issue.stream, issue.start_s) == ("dead camera", "view View1", None)
-        assert "are of one colour" in issue.message
-
-    def test_dead_for_a_while_among_noisy_frames(self, copied: Copied, issues_of: Find) -> None:
-        """They are one picture too, which is not told of a second time."""
-        folder = copied("raw")
-        noisy(folder, "View2")
-        for path in frames(folder, "View2")[20:50]:
-            Image.new("RGB", (224, 126), (90, 90, 90)).save(path)
-        assert [issue.kind for issue in issues_of(folder, views=["View2"])] == ["dead camera"]
-
-    def test_dead_twice(self, copied: Copied, issues_of: Find) -> None:
+    def test_dead_for_a_while(self, copied: Copied, issues_of: Find) -> None:
         folder = copied("raw")
         paths = frames(folder, "View2")
-        for path in (*paths[7:12], *paths[40:50]):
-            Image.new("RGB", (224, 126), (0, 135, 0)).save(path)
-        found = issues_of(folder, vlm_reuse_count=1)
-        assert [(issue.kind, issue.start_s, issue.stop_s) for issue in found] == [
-            ("dead camera", time_of(paths[7]), time_of(paths[11])),
-            ("dead camera", time_of(paths[40]), time_of(paths[49])),
-        ]
-        # A VL row serves three ticks, and of the frames between two rows nothing is said.
-        assert {one.kind for one in issues_of(folder)} == {"dead camera"}
+        for path in paths[20:50]:
+            Image.new("RGB", (224, 126), (90, 90, 90)).save(path)
+        (issue,) = issues_of(folder, vlm_reuse_count=1)
+        assert (issue.kind, issue.stream) == ("dead camera", "view View2")
+        assert (issue.start_s, issue.stop_s) == (time_of(paths[20]), time_of(paths[49]))
 
     def test_frozen_while_the_others_move(self, copied: Copied, issues_of: Find) -> None:
         folder = copied("raw")
@@ -111,29 +88,6 @@ class TestCameras:
         assert issue.start_s == pytest.approx(time_of(frozen[0]))
         assert issue.stop_s is not None and issue.stop_s >= time_of(frozen[-1])
         assert "other views move" in issue.message
-
-    def test_frozen_with_noise_in_its_pictures(self, copied: Copied, issues_of: Find) -> None:
-        folder = copied("raw")
-        noisy(folder, "View1")
-        assert issues_of(folder, views=["View1"]) == ()
-        frozen = frames(folder, "View1")[30:34]
-        for path in frozen[1:]:
-            path.write_bytes(frozen[0].read_bytes())
-        (issue,) = issues_of(folder, views=["View1"])
-        assert issue.kind == "duplicate frames" and "frames 30 to 33" in issue.message
-        assert (issue.start_s, issue.stop_s) == (time_of(frozen[0]), time_of(frozen[-1]))
-
-    def test_every_second_frame_twice(self, copied: Copied, issues_of: Find) -> None:
-        folder = copied("raw")
-        noisy(folder, "View1")
-        paths = frames(folder, "View1")
-        for first, second in zip(paths[::2], paths[1::2], strict=False):
-            second.write_bytes(first.read_bytes())
-        (issue,) = issues_of(folder, views=["View1"])
-        assert issue.kind == "duplicate frames"
-        assert f"{len(paths) // 2} of {len(paths) - 1} frames" in issue.message
-        twice = [time_of(path) for path in paths[1::2]]
-        assert (issue.start_s, issue.stop_s) == (twice[0], twice[-1])
 
     def test_one_picture_throughout(self, copied: Copied, issues_of: Find) -> None:
         folder = copied("raw")
@@ -198,14 +152,6 @@ class TestCameras:
         assert re.search(rf"time for ({len(lost)}|{len(lost) - 1}) more frames", issue.message)
         assert " Hz on average" in issue.message
 
-    def test_jitter_loses_no_frame(self, copied: Copied, issues_of: Find) -> None:
-        folder = copied("raw")
-        rng = np.random.default_rng(0)
-        for place, path in enumerate(frames(folder, "View2")):
-            time = time_of(path) + (0.07 * rng.random() if place % 3 == 1 else 0)
-            path.rename(path.with_name(f"{path.stem.rsplit('_', 1)[0]}_{time:.3f}.jpg"))
-        assert issues_of(folder) == ()
-
 
 class TestClocks:
     def test_a_gap(self, copied: Copied, issues_of: Find, change_csv) -> None:
@@ -227,36 +173,8 @@ class TestClocks:
         issues = issues_of(root, action_hz=None)
         assert any("say 15 Hz (LeRobot: fps in meta/info.json)" in one.message for one in issues)
 
-    def test_ticks_lost_at_both_ends(self, copied: Copied, issues_of: Find, change_npz) -> None:
-        folder = copied("raw")
-        names = ("timestamps", "forces", "alines")
-        change_npz(only(folder, "sensor_data_*.npz"), **dict.fromkeys(names, lambda v: v[1300:]))
-        for path in frames(folder, "View5")[-15:]:
-            path.unlink()
-        found = {issue.stream: issue for issue in issues_of(folder) if issue.kind == "lost ticks"}
-        assert set(found) == {"sensor", "view View5"}
-        for stream, said, lost_s in (("sensor", "begins 1.9", 2), ("view View5", "ends 1.", 1.5)):
-            issue = found[stream]
-            assert said in issue.message and issue.start_s is not None and issue.stop_s is not None
-            assert issue.stop_s - issue.start_s == pytest.approx(lost_s, abs=0.2)
-
 
 class TestChannels:
-    def test_flat_channels_are_one_line(self, copied: Copied, issues_of: Find, change_npz) -> None:
-        folder = copied("raw")
-
-        def dead(alines: np.ndarray) -> np.ndarray:
-            alines[:, 100:164] = 20
-            alines[:, 500] = 7
-            return alines
-
-        change_npz(only(folder, "sensor_data_*.npz"), alines=dead)
-        (issue,) = issues_of(folder)
-        assert (issue.kind, issue.stream) == ("flat channel", "sensor")
-        assert (
-            "65 of 1026 channels never change: aline_0100–aline_0163, aline_0500" in issue.message
-        )
-
     def test_a_joint_that_hardly_moves(self, copied: Copied, issues_of: Find, change_csv) -> None:
         folder = copied("raw")
         rng = np.random.default_rng(0)
@@ -276,32 +194,6 @@ class TestChannels:
         (issue,) = issues_of(folder)
         assert (issue.kind, issue.stream, issue.severity) == ("still channel", "state", "warning")
         assert issue.message.startswith("joint_3 hardly moves: a standard deviation of ")
-
-    def test_a_frozen_scan(self, copied: Copied, issues_of: Find, change_npz) -> None:
-        folder = copied("raw")
-
-        def stall(alines: np.ndarray) -> np.ndarray:
-            alines[1000:1650] = alines[1000]
-            return alines
-
-        path = only(folder, "sensor_data_*.npz")
-        change_npz(path, alines=stall)
-        with np.load(path) as archive:
-            time = archive["timestamps"]
-        (issue,) = issues_of(folder)
-        assert issue.kind == "frozen" and "all channels but the force" in issue.message
-        assert issue.start_s == pytest.approx(time[1000], abs=0.02)
-        assert issue.stop_s == pytest.approx(time[1649], abs=0.02)
-
-    def test_one_depth_that_holds_is_no_frozen_scan(self, copied, issues_of, change_npz):
-        folder = copied("raw")
-
-        def hold(alines: np.ndarray) -> np.ndarray:
-            alines[1000:1650, 0] = np.median(alines[:, 0])
-            return alines
-
-        change_npz(only(folder, "sensor_data_*.npz"), alines=hold)
-        assert issues_of(folder) == ()
 
     def test_an_action_outlier(self, copied: Copied, issues_of: Find) -> None:
         folder = copied("old")
@@ -343,12 +235,6 @@ class TestChannels:
         assert "joint_5 leaps to 0.3222" in found[ids[0], "state outlier", "state"]
         assert [key[0] for key in found if key[1:] == ("still channel", "action")] == ids
 
-    def test_runs_of_channels_by_name(self) -> None:
-        names = [f"c{index}" for index in range(40)]
-        assert named(names, [3]) == "c3"
-        assert named(names, [1, 2, 3, 7]) == "c1–c3, c7"
-        assert named(names, list(range(0, 40, 2))) == "c0, c2, c4, c6 and 16 more"
-
 
 def test_a_recording_may_be_very_short(copied: Copied, look: Callable[..., EpisodeView], issues_of):
     folder = copied("raw")
@@ -358,16 +244,7 @@ def test_a_recording_may_be_very_short(copied: Copied, look: Callable[..., Episo
     view = look(folder)
     assert view.timeline is None or len(view.timeline.time) <= 1
     found = issues_of(folder)
-    assert all(issue.kind in ("no ticks", "lost ticks") for issue in found) and found
-
-
-def noisy(folder: Path, view: str) -> None:
-    """Give a view's pictures the noise of a real sensor."""
-    rng = np.random.default_rng(0)
-    for path in frames(folder, view):
-        pixels = np.asarray(Image.open(path)).astype(np.float64)
-        pixels += rng.normal(0, 4, pixels.shape)
-        Image.fromarray(pixels.clip(0, 255).astype(np.uint8)).save(path, quality=90)
+    assert all(issue.kind in ("no ticks",) for issue in found) and found
 
 
 def metadata(folder: Path, **changes: object) -> None:

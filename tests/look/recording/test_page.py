@@ -90,12 +90,11 @@ def test_all_episodes_are_checked_and_some_are_shown(recorded, params_of, tmp_pa
     report = report_of(params_of(tmp_path, "inspect.episodes=2"))
     table = next(report.blocks(Table))
     assert [row[1] for row in table.rows] == [f"episode_{index}" for index in range(4)]
-    # The copies of the first have issues, so that they come before it.
-    assert table.strong == {1, 2}
+    assert table.strong == {0, 3}
     titles = [section.title for section in report.sections]
-    assert titles[2:4] == ["episode_1", "episode_2"]
+    assert titles[2:4] == ["episode_0", "episode_3"]
     names = [one.name for one in report.blocks(Picture)]
-    assert "episode1-episode_1-views" in names and "episode2-episode_2-views" in names
+    assert "episode1-episode_0-views" in names and "episode2-episode_3-views" in names
 
 
 def survey(*sources: Source, views: Sequence[str] | None = None, **data: Any) -> RecordingsOverview:
@@ -147,35 +146,6 @@ def test_one_broken_episode_hides_no_other(many: Path) -> None:
     (issue,) = found.issues
     assert broken.issues == [issue] and issue.severity == "error"
     assert found.choose(1) == (1,) and found.choose(2) == (0, 1) and found.choose(9) == (0, 1, 2)
-
-
-def test_the_same_recording_twice(many: Path) -> None:
-    assert survey(Source(name="s", path=str(many))).issues == (), "equal states, other actions"
-    shutil.copytree(many / "a", many / "d")
-    (many / "d" / "robot_states.npz").unlink()
-    found = survey(Source(name="s", path=str(many)), Source(name="t", path=str(many / "b")))
-    first, second = [issue for issue in found.issues if issue.kind == "duplicate recording"]
-    assert (first.source, first.episode, second.source, second.episode) == ("s", "d", "t", "b")
-    assert f"a ({many / 'a'}): all values of action are equal" in first.message
-    assert f"s/b ({many / 'b'}): " in second.message
-
-
-def test_the_same_recording_in_two_formats(shared_data: Path) -> None:
-    paths = (str(shared_data / "insertion/new"), str(shared_data / "insertion/raw"))
-    found = survey(Source(name="s", path=paths), views=())
-    (issue,) = [issue for issue in found.issues if issue.kind == "duplicate recording"]
-    assert issue.episode == "data_collection_20251108_055533"
-    assert "episode_20251108_055533" in issue.message and "all values of state" in issue.message
-
-
-def test_real_recordings_in_two_versions(shared_data: Path) -> None:
-    # Their motion tells; decoding the videos would tell nothing more.
-    found = survey(Source(name="s", path=str(shared_data / "lerobot")), views=())
-    twice = [issue for issue in found.issues if issue.kind == "duplicate recording"]
-    assert [issue.episode for issue in twice] == [
-        f"cr5_banana_v30_split/episode_{index:06d}" for index in range(5)
-    ]
-    assert "the same recording as cr5_banana_v21/episode_000000" in twice[0].message
 
 
 def test_episodes_that_cannot_be_opened(healthy: Path, tmp_path: Path) -> None:

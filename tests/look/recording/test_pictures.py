@@ -10,7 +10,6 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
-from pipeline.base.channels import unnumbered
 from pipeline.base.config import Params
 from pipeline.data import Channels, Stream
 from pipeline.look.page.blocks import Picture, Text
@@ -82,15 +81,6 @@ def test_names_are_written_as_they_are(view: EpisodeView) -> None:
         assert b"foo$" in svg or b"bar$" in svg
 
 
-def test_one_reading_of_a_profile_is_drawn_at_a_time_of_day(felt: Felt) -> None:
-    names = ("force", *(f"aline_{at}" for at in range(40)))
-    one = replace(felt(names, ("N", *[""] * 40), np.array([1.767e9]), np.ones((1, 41))), zero=0.0)
-    figure = draw_sensor(one)
-    figure.draw_without_rendering()
-    left, right, _, _ = figure.axes[1].images[0].get_extent()
-    assert right - left == pytest.approx(1e-3, rel=0.01)
-
-
 def test_a_scan_is_blank_where_its_clock_has_a_gap_and_nowhere_else(felt: Felt) -> None:
     names = ("force", *(f"aline_{at}" for at in range(40)))
     time = np.arange(1000) / 100
@@ -132,22 +122,21 @@ def test_long_curves_are_bitmaps_that_keep_every_extreme(felt: Felt) -> None:
 
 
 def test_lanes_show_every_clock_once_with_its_gap(view: EpisodeView) -> None:
-    whole, near = draw_lanes(view).axes
-    names = [label.get_text() for label in whole.get_yticklabels()]
+    (axis,) = draw_lanes(view).axes
+    names = [label.get_text() for label in axis.get_yticklabels()]
     views = ["view View1", "view View2", "view View5"]
     assert names == ["sensor", "state, poses", *views, "VL rows", "ticks"]
     assert view.state is not None
     (gap,) = Clock("state", "stream", view.state.time).gaps
-    for axis in (whole, near):
-        (gaps,) = [one for one in axis.collections if one.get_hatch() and one.get_paths()]
-        (box,) = (path.get_extents() for path in gaps.get_paths())
-        assert (box.x0, box.x1) == pytest.approx((gap.start_s - view.zero, gap.stop_s - view.zero))
-    assert near.get_xlim()[0] < gap.start_s - view.zero < near.get_xlim()[1]
+    (gaps,) = [one for one in axis.collections if one.get_hatch() and one.get_paths()]
+    (box,) = (path.get_extents() for path in gaps.get_paths())
+    assert (box.x0, box.x1) == pytest.approx((gap.start_s - view.zero, gap.stop_s - view.zero))
+    assert axis.get_xlim()[0] < gap.start_s - view.zero < axis.get_xlim()[1]
 
 
 def test_lines_lead_from_the_frame_to_its_row_and_from_there_to_its_ticks(view):
     assert view.timeline is not None
-    line, (_, near) = view.timeline, draw_lanes(view).axes
+    line, (near,) = view.timeline, draw_lanes(view).axes
     lines = [lines for lines in near.collections if isinstance(lines, LineCollection)]
     # After the strokes of the lanes.
     *took, served = [np.array(ends.get_segments())[..., 0] + view.zero for ends in lines[-4:]]
@@ -158,18 +147,9 @@ def test_lines_lead_from_the_frame_to_its_row_and_from_there_to_its_ticks(view):
     assert served[:, 0] == pytest.approx(line.vl_time[line.vl_row[ticks]])
 
 
-def test_a_long_clock_has_as_many_strokes_as_there_is_room_for(felt: Felt) -> None:
-    time = np.arange(3600 * 650) / 650
-    long = felt(("force",), ("N",), time, np.zeros((len(time), 1)))
-    alone = replace(long, timeline=None, state=None, poses=None, cameras={})
-    whole, _ = draw_lanes(alone).axes
-    (strokes,) = [one for one in whole.collections if isinstance(one, LineCollection)]
-    assert 1000 < len(strokes.get_segments()) <= 1501
-
-
 def test_without_ticks_lanes_are_drawn_and_without_streams_nothing(view, draw) -> None:
-    whole, _ = draw_lanes(replace(view, timeline=None)).axes
-    assert len(whole.get_yticks()) == 5
+    (axis,) = draw_lanes(replace(view, timeline=None)).axes
+    assert len(axis.get_yticks()) == 5
     absent = {"cameras": {}, "sensor": None, "state": None, "poses": None, "action": None}
     empty = replace(view, timeline=None, **absent)
     for blocks in (camera_blocks, sensor_blocks, motion_blocks, clock_blocks, statistics_blocks):
@@ -192,12 +172,6 @@ def test_channels_of_one_unit_share_a_panel_and_profiles_and_grippers_are_apart(
         ("[deg]", 2, ""),
         ("aline", 40, "aline"),
     ]
-
-
-def test_channels_that_a_number_tells_apart_share_a_name() -> None:
-    assert unnumbered("aline_0012") == unnumbered("aline_7") == "aline_#"
-    assert unnumbered("joint_1_vel") != unnumbered("joint_1_pos")
-    assert unnumbered("force") == "force"
 
 
 def test_the_same_recording_is_the_same_bytes(view: EpisodeView) -> None:

@@ -18,7 +18,6 @@ from pipeline.look.recording.samples import (
     Sample,
     batch_table,
     cut_samples,
-    describe_stretch,
     draw_samples,
     fold_tokens,
     show_prompt,
@@ -155,7 +154,7 @@ class TestPrompt:
         words = "".join(run.text for run in prompt.runs)
         assert view.instruction is not None and view.instruction in words
         # 14-pixel patches, merged two by two.
-        assert [(row[0], row[2], row[4]) for row in sizes.rows] == [
+        assert [(row[0], row[2], row[3]) for row in sizes.rows] == [
             (name, "56 × 84", 6) for name in ("View1", "View2", "View5")
         ]
         assert "18 of images" in text.words
@@ -167,12 +166,6 @@ class TestPrompt:
         # The folded tokens are the rendered prompt, with one placeholder an image.
         assert words == Preparer(vlm, spec).render(view.instruction, list(view.cameras))
 
-    def test_a_letter_of_several_tokens_is_spelled_out(self, healthy, look, vlm, spec) -> None:
-        view = replace(look(healthy / "old"), instruction="바늘")
-        _, prompt, *_ = show_prompt(view, vlm, spec)
-        assert isinstance(prompt, Tokens)
-        assert all(run.text and "\ufffd" not in run.text for run in prompt.runs)
-
     def test_what_stands_in_its_way(self, healthy, look: Look, vlm: VLMParams, spec) -> None:
         view = look(healthy / "old")
         with pytest.raises(VLMError, match="no such folder"):
@@ -183,12 +176,6 @@ class TestPrompt:
             show_prompt(replace(view, instruction=None), vlm, spec)
         with pytest.raises(RecordingError, match="no tick"):
             show_prompt(replace(view, timeline=None), vlm, spec)
-
-
-def test_what_the_model_sees_in_another_shape_is_said() -> None:
-    assert describe_stretch((720, 1280), (364, 644)) is None
-    assert describe_stretch((480, 640), (364, 644)) == "33% in width"
-    assert describe_stretch((720, 1280), (200, 200)) == "78% in height"
 
 
 def test_image_tokens_are_folded_view_by_view() -> None:
