@@ -221,7 +221,6 @@ def _numbers(section: type[Section], above: str = "") -> Iterator[tuple[str, dic
             yield from ((place, schema) for schema in inside(TypeAdapter(kind).json_schema()))
 
 
-UNBOUNDED = {"vlm.layers", "extract.workers", "verify.workers"}
 """The model has so many layers; workers are bounded by a function of their own."""
 
 
