@@ -221,6 +221,7 @@ def _numbers(section: type[Section], above: str = "") -> Iterator[tuple[str, dic
             yield from ((place, schema) for schema in inside(TypeAdapter(kind).json_schema()))
 
 
+UNBOUNDED = {"vlm.layers", "extract.workers"}
 """The model has so many layers; workers are bounded by a function of their own."""
 
 
