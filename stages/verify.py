@@ -40,6 +40,7 @@ SHORTHANDS = (
 def main(params: "Params") -> None:
     """Check the store, and repair it or compute rows again if requested; raises on errors."""
     from pipeline.base.errors import NumericsError, StoreIncomplete
+    from pipeline.base.text import capped
     from pipeline.extract.reextract import reextract
     from pipeline.store.border import mend
     from pipeline.store.verification import verify
@@ -62,7 +63,8 @@ def main(params: "Params") -> None:
         computed = reextract(store, params, print)
         print("\n".join(computed.lines()))
         if computed.beyond:
-            lines = [f"{store}: rows are not what they would be today:", *computed.refusals()]
+            beyond = capped([str(row) for row in computed.beyond], "rows beyond the tolerance")
+            lines = [f"{store}: rows are not what they would be today:", *beyond]
             raise NumericsError("\n".join(lines))
 
 

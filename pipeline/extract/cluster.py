@@ -36,7 +36,6 @@ from distributed import (
 )
 from distributed.scheduler import NoWorkerError
 from numpy.typing import NDArray
-from tqdm import tqdm
 
 from pipeline.base.config import ExtractParams
 from pipeline.base.differences import describe, differences
@@ -108,7 +107,6 @@ class ExtractionPlugin(WorkerPlugin):
         """`known` are stores and builds of the same feature spec."""
         self.surveyed = surveyed
         self.known = [path.absolute() for path in known]
-        self.folder = Path.cwd()  # where relative paths begin
         # The next extraction of a store replaces the plugin of one that was killed.
         self.name = f"extraction of {surveyed.target.absolute()}"
 
@@ -145,15 +143,13 @@ class ExtractionPlugin(WorkerPlugin):
             return [block.write(self._build) for block in blocks]
 
     def check_place(self) -> None:
-        """Raise `ConfigError` where this worker does not see the coordinator's files."""
-        here, host = Path.cwd(), socket.gethostname()
-        surveyed, part = self.surveyed, part_path(self.surveyed.target)
-        same = self.folder.is_dir() and here.samefile(self.folder)
-        if not same or read_plan(part) != surveyed.plan:
+        """Raise `ConfigError` where this worker does not see the build or has another model."""
+        host, surveyed = socket.gethostname(), self.surveyed
+        if read_plan(part := part_path(surveyed.target)) != surveyed.plan:
             raise ConfigError(
-                f"the worker on {host} runs in {here}, the coordinator in {self.folder}, with the "
-                f"build {part}. Start every worker with `cd {self.folder}`, and set extract.store "
-                "to a folder of a file system that all hosts share."
+                f"the worker on {host} finds no build {part} from its folder {Path.cwd()}. Start "
+                "every worker in the coordinator's folder, and set extract.store to a folder of a "
+                "file system that all hosts share."
             )
         if not self.local:
             vlm, dtype, spec = surveyed.vlm, surveyed.extract.dtype, surveyed.spec
@@ -220,7 +216,8 @@ def compute_on_cluster(
     rows = _AUTO_RANGE_ROWS if extract.batch_size == "auto" else extract.batch_size
     most = max(1, rows // surveyed.spec.variants)
     # On several hosts, no two ranges may share a page of the file.
-    together = 1 if plugin.local else rows_between_pages(array.row_bytes)
+    page_rows = PAGE_BYTES // math.gcd(array.row_bytes, PAGE_BYTES)
+    together = 1 if plugin.local else page_rows  # it divides every chunk
     ranges = ranges_of(missing, most, array.chunk_rows, together)
     begun, before = 0.0, 0
     with connected(extract) as client, _plugged(client, plugin):
@@ -299,26 +296,17 @@ class ClusterTasks:
 
     def _raise_unless_recording(self, error: Exception) -> None:
         """Raise the error unless a recording may have caused it."""
-        if isinstance(error, CancelledError):
+        if isinstance(error, KilledWorker):
+            self._dead.add(error.last_worker.address)
+        hopeless = len(self._dead) >= _HOPELESS_DEATHS and not self._any_written
+        if hopeless or isinstance(error, CancelledError | NoWorkerError):
             raise PipelineError(
-                f"the connection to the dask scheduler was lost ({error}). What was written is "
-                "kept: start scheduler and workers again, and run the same command."
-            )
-        if isinstance(error, NoWorkerError):
-            raise PipelineError(
-                "no worker has been there for two minutes: they were killed, or ran out of memory. "
-                "What was written is kept: run the same command again, with fewer extract.workers."
+                f"the dask workers or their scheduler were lost ({error}): killed, out of memory, "
+                "or not reached. What was written is kept: look at their logs, give them more "
+                "memory or take fewer extract.workers, and run the same command again."
             )
         if not isinstance(error, KilledWorker | RecordingError | NumericsError):
             raise error
-        if isinstance(error, KilledWorker) and error.last_worker.address not in self._dead:
-            self._dead.add(error.last_worker.address)
-            tqdm.write(f"the worker {error.last_worker.address} died", file=sys.stderr)
-        if not self._any_written and len(self._dead) >= _HOPELESS_DEATHS:
-            raise PipelineError(
-                "workers died again and again before a single row was written. Do they have enough "
-                "memory for the model? Look at their logs, or run with extract.workers=0."
-            )
 
     def _reason(self, episode: int, rows: Range, error: Exception) -> str:
         """Why the rows of an episode could not be computed, even without other rows."""
@@ -329,14 +317,6 @@ class ClusterTasks:
         path = str(self._plugin.surveyed.recordings[episode].path)
         where = "" if path in str(error) else f"{path}, VL rows {rows[0]} to {rows[-1]}: "
         return f"{where}{error}"
-
-
-def rows_between_pages(row_bytes: int) -> int:
-    """The least number of rows that fills whole pages of a file.
-
-    It divides every chunk: chunks are multiples of 4,096 rows.
-    """
-    return PAGE_BYTES // math.gcd(row_bytes, PAGE_BYTES)
 
 
 def ranges_of(missing: Range, most: int, chunk_rows: int, together: int = 1) -> list[Range]:
@@ -356,27 +336,16 @@ def _plugged(client: Client, plugin: ExtractionPlugin) -> Generator[None]:
     """Give the plugin to every worker, now and later; take it back at the end."""
     try:
         client.register_plugin(plugin)
-    except ImportError as error:
+    except (ImportError, OSError) as error:
         raise ConfigError(
-            f"extract.workers: a worker cannot import what it should run ({error}). Install the "
-            f"same version of this package there as on {socket.gethostname()}."
-        ) from None
-    except OSError as error:
-        raise PipelineError(
-            f"extract.workers: a worker died as it began, or the scheduler with it ({error}). Run "
-            "the same command again, with fewer extract.workers where memory is short."
+            f"extract.workers: a worker cannot begin ({error}). Install the same version of this "
+            f"package there as on {socket.gethostname()}, or give it more memory."
         ) from None
     try:
         yield
     finally:
         if client.status == "running":
             client.unregister_worker_plugin(plugin.name)
-
-
-def check_scheduler(address: str) -> None:
-    """Raise `ConfigError` where no scheduler answers at the address of `extract.workers`."""
-    with quiet(), client_of(address, _SETTING):
-        pass
 
 
 @contextmanager

@@ -38,7 +38,6 @@ class Deviation:
     """
 
     row: int
-    absolute: float
     relative: float
     slot: int
     same_pixels: bool
@@ -46,10 +45,7 @@ class Deviation:
 
     def __str__(self) -> str:
         pixels = "" if self.same_pixels else "; the decoder of today gives other pixels"
-        return (
-            f"{self.where}: slot {self.slot} deviates {self.relative:.2e} of its size, "
-            f"{self.absolute:.2e} absolute{pixels}"
-        )
+        return f"{self.where}: slot {self.slot} deviates {self.relative:.2e} of its size{pixels}"
 
 
 @dataclass(frozen=True)
@@ -84,10 +80,6 @@ class Reextraction:
             *(f"environment, {line}" for line in self.environment),
             *unchecked,
         ]
-
-    def refusals(self) -> list[str]:
-        """The rows beyond the tolerance, in lines for people."""
-        return capped([str(row) for row in self.beyond], "rows beyond the tolerance")
 
 
 def reextract(path: Path, params: Params, say: Callable[[str], None]) -> Reextraction:
@@ -150,5 +142,4 @@ def _compare(store: FeatureStore, row: ReadyRow, features: NDArray[Any]) -> Devi
     deviations = slot_deviations(widen(stored), widen(features), code_size(stored))
     slot = deviations.worst
     same_pixels = store.array("vl/key")[row.row].tobytes() == row.key
-    absolute, relative = float(deviations.absolute.max()), float(deviations.relative[slot])
-    return Deviation(row.row, absolute, relative, slot, same_pixels, row.where)
+    return Deviation(row.row, float(deviations.relative[slot]), slot, same_pixels, row.where)

@@ -230,7 +230,7 @@ def plan_lines(
         time = f"about {duration(left / rows_per_s)} at {rows_per_s:.1f} rows/s, as last measured"
     needed, free = size(store_bytes(build.specs)), size(free_bytes(build.part))
     return [
-        *(f"WARNING: {warning}" for warning in _warnings(surveyed, left)),
+        *(f"WARNING: {warning}" for warning in _warnings(surveyed)),
         *(f"why: {reason}" for reason in reasons),
         f"episodes: {len(surveyed.episodes)}",
         f"rows: {rows}, {known} known, {left} to compute"
@@ -261,9 +261,9 @@ def _reasons(surveyed: Survey, before: RowSource) -> Iterator[str]:
         yield "extract.sensor_dtype, action_hz, the order of episodes or their actions changed"
 
 
-def _warnings(surveyed: Survey, missing: int) -> Iterator[str]:
+def _warnings(surveyed: Survey) -> Iterator[str]:
     """What the user may not intend, each with what to do about it."""
-    data, vlm, extract = surveyed.data, surveyed.vlm, surveyed.extract
+    data = surveyed.data
     recordings, views = surveyed.recordings, surveyed.spec.views
     if not views and data.views != ():
         yield (
@@ -279,16 +279,6 @@ def _warnings(surveyed: Survey, missing: int) -> Iterator[str]:
             "euler_delta in place of rotvec. To keep rotvec: give these a store of their own. To "
             "say that it is meant: --set data.action_rotation=euler_delta"
         )
-    # The devices of the workers of a dask scheduler are not known.
-    if missing and vlm.dtype != "float32" and isinstance(extract.workers, int):
-        from pipeline.base.machine import resolve_device
-
-        if resolve_device(extract.device).type == "cpu":
-            yield (
-                f"the model will run on the CPU in vlm.dtype {vlm.dtype}, which many CPUs "
-                "only emulate, slowly. Set vlm.dtype=float32, or extract on a GPU, before the "
-                "first long run: no row is taken over by another dtype"
-            )
 
 
 def count_known(

@@ -49,6 +49,7 @@ from pipeline.store.chunks import METADATA_DIGEST, SEAL, check_seal, check_trail
 from pipeline.store.golden import golden_places, read_golden
 from pipeline.store.lock import build_lock
 from pipeline.store.paths import STORE, group_attributes, part_path, recover, unfinished_plans
+from pipeline.store.paths import put_in_place as put_store_in_place
 from pipeline.store.reader import FeatureStore
 from pipeline.store.schema import (
     ARRAY_NAMES,
@@ -277,7 +278,7 @@ def _rebuild(manifest: Manifest, archive: Path, target: Path, part: Path) -> Non
             read_golden(part, read_rows(part, specs[KEYS]))
         except StoreIncomplete as error:
             raise _damaged(archive, str(error).removesuffix(f". {mend(part)}")) from None
-        build.put_in_place()
+        put_store_in_place(target)
 
 
 def _archived_rows(archive: Path, spec: ArraySpec) -> Iterator[tuple[range, NDArray[Any]]]:

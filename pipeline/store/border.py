@@ -36,11 +36,8 @@ def gc_command(path: Path) -> str:
 
 
 def restore_command(archive: Path) -> str:
-    """The command that restores a store beside its archive."""
-    name = archive.stem.removesuffix(".archive")
-    store = archive.with_name(f"{name if name != archive.stem else name + '.restored'}.zarr")
-    places = setting("archive.output", archive), setting("archive.store", store)
-    return command("archive", "--restore", *places)
+    """The command that restores a store from an archive."""
+    return command("archive", "--restore", setting("archive.output", archive))
 
 
 def mend(path: Path) -> str:
@@ -58,9 +55,8 @@ def start_over(path: Path) -> str:
     if folder != store:
         return mend(path)
     return (
-        "Without them its feature rows are of no use, and --repair cannot begin. Remove or rename "
-        f"{store}, then run {extract_command(store)}, which computes all of it, or "
-        f"{command('archive', '--restore')}, which takes it from an archive."
+        f"Nothing can be taken from it without them. Remove or rename {store}, then run "
+        f"{extract_command(store)}, or {command('archive', '--restore')}."
     )
 
 

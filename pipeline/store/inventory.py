@@ -185,14 +185,6 @@ def _details(entry: StoreEntry) -> Iterator[str]:
     if entry.damage:
         # What is wrong, without the advice after it.
         yield f"damaged: {entry.damage.split('. ', 1)[0].splitlines()[0]}"
-    if (root := entry.attributes) and entry.kind == "store":
-        streams = ("tick/action", "sensor/values", "state/values")
-        action, sensor, state = (entry.specs[name].shape[1] for name in streams)
-        rate = "recorded rows" if root.action_hz is None else f"{root.action_hz:g} Hz"
-        yield (
-            f"{root.streams.action.kind} action {action}, sensor {sensor}, state {state}; {rate}, "
-            f"an answer every {root.vlm_reuse_count} ticks; sources {', '.join(root.sources)}"
-        ).strip()
     if entry.kind == "build" and is_locked(entry.base):
         yield "being built"
 

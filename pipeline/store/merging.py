@@ -94,9 +94,9 @@ class EpisodeRun:
 class MergedEpisodes:
     """The episodes of several stores one after the other; those of equal digest only once.
 
-    Different episodes of the same name, such as from two places that both call a source `lab`, are
-    renamed after their store, and that is printed. `arrays` has the arrays under `episode/`;
-    `twice` counts the episodes that an earlier input also has.
+    Different episodes of the same name, such as from two places that both call a source `lab`, get
+    the number of their store before their name, and that is printed. `arrays` has the arrays under
+    `episode/`; `twice` counts the episodes that an earlier input also has.
     """
 
     def __init__(self, stores: Sequence[FeatureStore]) -> None:
@@ -105,22 +105,18 @@ class MergedEpisodes:
         self.episodes: list[Episode] = []
         taken: list[tuple[FeatureStore, Episode]] = []
         digests: set[str] = set()
-        names: dict[tuple[str, str], Path] = {}
-        for store in stores:
+        names: set[tuple[str, str]] = set()
+        for number, store in enumerate(stores, start=1):
             for episode in store.episodes:
                 if episode.digest in digests:
                     continue
                 digests.add(episode.digest)
-                name = _free_name(episode, store.path, names)
-                if name != episode.id:
-                    other = names[episode.source, episode.id]
-                    print(
-                        f"{store.path}: its {episode.source}/{episode.id} is another episode than "
-                        f"that of {other}, and named {episode.source}/{name}"
-                    )
-                names[episode.source, name] = store.path
+                if (episode.source, episode.id) in names:
+                    was, episode = episode, replace(episode, id=f"{number}/{episode.id}")
+                    print(f"{store.path}: {was.source}/{was.id} is named {episode.id}")
+                names.add((episode.source, episode.id))
                 taken.append((store, episode))
-                self.episodes.append(replace(episode, id=name))
+                self.episodes.append(episode)
         self.twice = sum(len(store.episodes) for store in stores) - len(self.episodes)
         self.arrays = index_arrays(self.episodes, self.sources)
         self.runs = [*self._runs(taken)]
@@ -280,14 +276,6 @@ def _form(store: FeatureStore) -> dict[str, Any]:
 def _has(store: FeatureStore, stream: str) -> bool:
     """Whether a store has this stream; only sensor and state may be absent."""
     return stream not in ("sensor", "state") or store.array(f"{stream}/values").shape[1] > 0
-
-
-def _free_name(episode: Episode, store: Path, names: Mapping[tuple[str, str], Path]) -> str:
-    name, number = episode.id, 1
-    while (episode.source, name) in names:
-        prefix = store.stem if number == 1 else f"{store.stem}-{number}"
-        name, number = f"{prefix}/{episode.id}", number + 1
-    return name
 
 
 def _copy(build: StoreBuild, merged: MergedEpisodes) -> None:

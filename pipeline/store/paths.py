@@ -209,14 +209,12 @@ def find_attributes(root: Path) -> dict[str, Any]:
             f"{restore_command(root)}"
         )
     if "schema" not in attributes:
-        part = root if build else part_path(root)
         target = root.with_name(root.name.removesuffix(".part"))
         actual, then = "nothing there", f"Run {extract_command(target)}."
-        if part.exists():
+        if (part := part_path(target)).exists():
             actual = f"only the unfinished build {part}"
         elif there(root):
-            actual = f"{described(root)} and no zarr.json that says so"
-            then = f"It was left as it is: name another place, or, if it was one, {mend(root)}"
+            actual, then = f"{described(root)} and no zarr.json that says so", mend(root)
         raise StoreIncomplete(f"{root}: no finished store, found {actual}. {then}")
     if attributes["schema"] not in READABLE:
         raise StoreMismatch(

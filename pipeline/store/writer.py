@@ -260,7 +260,7 @@ class StoreBuild:
         after a kill. Raises `StoreIncomplete` when rows are missing, or a file was changed.
         """
         self.finish()
-        self.put_in_place(keep)
+        put_in_place(self.target, keep)
 
     def finish(self) -> None:
         """The first half of `seal`: the complete store is on the disk, still in the part."""
@@ -280,10 +280,6 @@ class StoreBuild:
             partial.unlink()
         self.close()
         sync_folders(self.part)
-
-    def put_in_place(self, keep: bool = False) -> None:
-        """The second half of `seal`; it takes an instant."""
-        put_in_place(self.target, keep)
 
     def close(self) -> None:
         """Close every file."""

@@ -32,7 +32,7 @@ from pipeline.base.errors import (
     RecordingError,
     VLMError,
 )
-from pipeline.extract.cluster import ExtractionPlugin, check_scheduler, connected
+from pipeline.extract.cluster import ExtractionPlugin, connected
 from pipeline.extract.survey import Survey, survey
 from pipeline.store import FeatureStore, RowSource, StoreBuild, part_path
 from pipeline.vlm.feature_spec import feature_spec
@@ -354,17 +354,16 @@ class TestRefusals:
     def test_a_wrong_address(self, changed, monkeypatch, address):
         monkeypatch.setattr("pipeline.base.scheduler.TIMEOUT_S", 1)
         wrong = changed(extract={"workers": address})
-        for reach in (run, lambda params: check_scheduler(params.extract.workers)):
-            with pytest.raises(ConfigError, match="no dask scheduler answers at"):
-                reach(wrong)
+        with pytest.raises(ConfigError, match="no dask scheduler answers at"):
+            run(wrong)
 
-    def test_a_worker_elsewhere(self, params, changed, tmp_path, monkeypatch):
+    def test_a_worker_elsewhere(self, params, monkeypatch):
         spec = feature_spec(params.vlm, params.extract.dtype, ["View1", "View2"], file_digest)
         elsewhere = params.extract.model_copy(update={"workers": "tcp://elsewhere:8786"})
         sections = params.data, params.vlm, elsewhere
         surveyed = Survey(*sections, (), (), (), spec, "rotvec", "plan")
         plugin = ExtractionPlugin(surveyed, ())
-        with pytest.raises(ConfigError, match=r"with the build .*made\.zarr\.part"):
+        with pytest.raises(ConfigError, match=r"finds no build .*made\.zarr\.part"):
             plugin.check_place()
         monkeypatch.setattr("pipeline.extract.cluster.read_plan", lambda part: "plan")
         plugin.check_place()
@@ -372,9 +371,6 @@ class TestRefusals:
         other = ExtractionPlugin(replace(surveyed, vlm=other_vlm), ())
         with pytest.raises(ConfigError, match="would compute other features"):
             other.check_place()
-        monkeypatch.chdir(tmp_path)
-        with pytest.raises(ConfigError, match=f"runs in {tmp_path}"):
-            plugin.check_place()
 
     def test_local_workers_take_turns_over_the_gpus(self, changed, monkeypatch):
         monkeypatch.setattr("torch.cuda.device_count", lambda: 2)
@@ -424,7 +420,7 @@ class TestScheduler:
             monkeypatch.setattr(StoreBuild, "mark", then_killed)
             address = json.loads(address_file.read_text())["address"]
             params = changed(extract={"workers": address, "batch_size": 1})
-            with pytest.raises(PipelineError, match="connection to the dask scheduler was lost"):
+            with pytest.raises(PipelineError, match="workers or their scheduler were lost"):
                 run(params)
         finally:
             for process in (scheduler, worker):
@@ -490,7 +486,7 @@ class TestStart:
 
     def test_a_worker_killed_as_it_is_told_what_to_do_is_said(self, changed, workers):
         workers.ask("kill-at-setup")
-        with pytest.raises(PipelineError, match=r"extract\.workers: a worker died as it began"):
+        with pytest.raises(ConfigError, match=r"extract\.workers: a worker cannot begin"):
             run(changed(extract={"workers": workers.address}))
 
     @pytest.mark.parametrize(

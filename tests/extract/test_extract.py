@@ -608,21 +608,6 @@ class TestPlan:
         notes = [line for line in lines if "ticks at" in line]
         assert notes == ([] if said is None else [f"source 'made': {said}"])
 
-    @pytest.mark.parametrize(
-        ("dtype", "extract", "warned"),
-        [
-            ("bfloat16", {"device": "cpu"}, True),
-            ("float32", {"device": "cpu", "workers": 2}, False),
-            ("bfloat16", {"device": "cpu", "workers": "tcp://gpus:8786"}, False),
-        ],
-    )
-    def test_warns_of_half_precision_on_a_cpu(self, changed, dtype, extract, warned):
-        _, said = run(changed(extract={"plan": True} | extract, vlm={"dtype": dtype}))
-        warnings = [line for line in said if line.startswith("WARNING: ")]
-        assert len(warnings) == warned
-        assert all(dtype in line and "vlm.dtype=float32" in line for line in warnings)
-
-    @pytest.mark.usefixtures("extracted")
     def test_names_a_time_once_a_speed_is_known(self, changed):
         for sections in {"data": {"vlm_reuse_count": 2}}, {"vlm": {"prompt": "{images}"}}:
             _, said = run(changed(extract={"plan": True}, **sections))

@@ -1,12 +1,11 @@
 """Ranges hold every missing row once, and never more than a task may have."""
 
 import numpy as np
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.data.episode import by_episode
-from pipeline.extract.cluster import PAGE_BYTES, ranges_of, rows_between_pages
+from pipeline.extract.cluster import ranges_of
 
 
 @st.composite
@@ -40,10 +39,3 @@ def test_the_rows_of_a_range_are_told_apart_by_episode(rows):
 def test_a_batch_is_filled_where_nothing_forbids_it():
     ranges = ranges_of(np.arange(10), 4, 4096)
     assert [one.tolist() for one in ranges] == [[0, 1, 2, 3], [4, 5, 6, 7], [8, 9]]
-
-
-@pytest.mark.parametrize(("row_bytes", "rows"), [(4096, 1), (8192, 1), (7168, 4), (96, 128)])
-def test_rows_between_pages(row_bytes, rows):
-    assert rows_between_pages(row_bytes) == rows
-    assert rows * row_bytes % PAGE_BYTES == 0
-    assert 4096 % rows == 0, "chunks are multiples of 4,096 rows"

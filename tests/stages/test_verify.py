@@ -87,7 +87,7 @@ def test_a_store_that_is_not_finished(verified, store, capsys):
 def test_rows_computed_again(verified, store, capsys, monkeypatch, relative, code):
     def found(path, params, say):
         assert (path, params.verify.reextract) == (store, 3)
-        return Reextraction((Deviation(7, relative, relative, 2, True, "here"),), 1e-3, (), ())
+        return Reextraction((Deviation(7, relative, 2, True, "here"),), 1e-3, (), ())
 
     monkeypatch.setattr("pipeline.extract.reextract.reextract", found)
     assert verified("--reextract", "3") == code

@@ -16,7 +16,7 @@ import pytest
 from pipeline.base.errors import PipelineError, StoreIncomplete
 from pipeline.store import FeatureStore, RowSource, part_path
 from pipeline.store.archive import archive, restore
-from pipeline.store.border import mend, restore_command, start_over
+from pipeline.store.border import mend, start_over
 from pipeline.store.chunks import note_metadata
 from pipeline.store.paths import read_plan
 from pipeline.store.verification import verify
@@ -296,8 +296,3 @@ class TestRemedies:
             with pytest.raises(StoreIncomplete) as caught:
                 read_plan(tmp_path / name)
             assert start_over(tmp_path / name) in str(caught.value)
-
-    def test_an_archive_is_restored_to_a_store_beside_it(self):
-        for name, store in (("x/a.archive.zarr", "x/a.zarr"), ("x/a.zarr", "x/a.restored.zarr")):
-            advice = restore_command(Path(name))
-            assert advice.endswith(f"--set archive.output={name} --set archive.store={store}")

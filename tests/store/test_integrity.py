@@ -194,7 +194,7 @@ class TestStructure:
         del document["attributes"]["plan"]
         for text in (json.dumps(document), "{"):
             (store / "zarr.json").write_text(text)
-            with pytest.raises(StoreIncomplete, match=r"--repair cannot.*stages.archive --restore"):
+            with pytest.raises(StoreIncomplete, match=r"Nothing can be taken.*archive --restore"):
                 verify(store)
 
 

@@ -147,10 +147,10 @@ def test_different_episodes_of_one_name_are_renamed(
     second = tiny_store(tmp_path, name="second", seed=2, episodes=1)
     third = tiny_store(tmp_path / "third", name="second", seed=3, episodes=1)
     merge([first, second, third], output)
-    assert "its left/episode_000 is another episode than that of" in capsys.readouterr().out
+    assert "left/episode_000 is named 2/episode_000" in capsys.readouterr().out
     merged = FeatureStore.open(output)
-    assert_holds(merged, second, {"episode_000": "second/episode_000"})
-    assert_holds(merged, third, {"episode_000": "second-2/episode_000"})
+    assert_holds(merged, second, {"episode_000": "2/episode_000"})
+    assert_holds(merged, third, {"episode_000": "3/episode_000"})
 
 
 def test_a_stream_that_one_lacks_is_that_of_the_other(
