@@ -1,6 +1,6 @@
 """The samples and batches of a data set, and how samples become a batch."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -45,9 +45,6 @@ class UnifiedBatch(Batch):
         return {
             name: value if value is None else value[index] for name, value in vars(self).items()
         }
-
-    def __iter__(self) -> Iterator[Sample]:
-        return (self[index] for index in range(len(self)))
 
     def inputs(self) -> dict[str, Any]:
         """The keyword arguments with which `QwenVLAUnified.forward` gives the loss."""

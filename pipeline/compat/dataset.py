@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -18,7 +18,6 @@ from pipeline.compat.stores import (
     check_store,
     episodes_of_format,
     episodes_of_recordings,
-    first_keys,
     read_frames,
     store_in_memory,
 )
@@ -46,9 +45,8 @@ class UnifiedVLADataset(Dataset[Sample]):
 
     `horizon` is in ticks, the windows are in readings, none of them older than `sensor_window_s`
     and `state_window_s` (None: any age). With `action_hz` None, the ticks are the recorded rows or
-    those of the store. Open `recordings` may replace `data`. `instruction` replaces the
-    instructions of `data`. All recordings have one kind of `action_rotation`; `auto` is rotvec if
-    every recording has poses.
+    those of the store. `instruction` replaces the instructions of `data`. All recordings have one
+    kind of `action_rotation`; `auto` is rotvec if every recording has poses.
 
     Works in DataLoader workers however they are started: unpickling opens the data again. Use
     `unified_collate_fn`. Raises `RecordingError` for recordings that are missing or broken,
@@ -79,30 +77,18 @@ class UnifiedVLADataset(Dataset[Sample]):
         views: Sequence[str] | None = None,
         action_rotation: Rotation = "auto",
         store: FeatureStore | str | Path | None = None,
-        recordings: Sequence[Recording] | None = None,
     ) -> None:
-        known = {"format": (format, Format), "action_rotation": (action_rotation, Rotation)}
-        for name, (value, kinds) in known.items():
-            if value not in get_args(kinds):
-                raise ConfigError(f"{name}: expected one of {get_args(kinds)}, found {value!r}")
         windows = (sensor_window_size, state_window_size, sensor_window_s, state_window_s)
         self.windows = Windows(horizon, *windows)
         self.vlm_reuse_count, self.action_hz = vlm_reuse_count, action_hz
         self.action_rotation: Rotation = action_rotation
         self._sources = named_sources(() if data is None else data, format, instruction)
-        self._format, self._views, self._given = format, views, recordings
+        self._format, self._views = format, views
         self._cached = FeatureStore.open(store) if isinstance(store, str | Path) else store
-        if min(horizon, sensor_window_size, state_window_size, vlm_reuse_count) < 1:
+        if self._cached is not None and not (instruction is None and views is None):
             raise ConfigError(
-                "horizon, windows and vlm_reuse_count count from 1, found "
-                f"{self.windows} and vlm_reuse_count={vlm_reuse_count}"
-            )
-        opened = recordings is not None or self._cached is not None
-        both = recordings is not None and data is not None
-        if both or (opened and not (instruction is None and views is None)):
-            raise ConfigError(
-                "data, instruction and views say how recordings are opened, but the recordings are "
-                "open already, or their features computed. Leave these out, or recordings and store"
+                "instruction and views say how recordings are opened, but the store's features are "
+                "computed already. Leave these out, or the store"
             )
         self._open()
 
@@ -142,9 +128,8 @@ class UnifiedVLADataset(Dataset[Sample]):
         `val_fraction`, test: 0}. With frames they are the same if sources and episodes have the
         store's names: the side follows from the hash of "source/id". Use `unified_collate_fn`.
         """
-        keys = None if self._frames is None else first_keys(self._frames)
         params = SplitParams(val=val_fraction, test=0)
-        split = split_by_episode(self.store, params, self.windows.horizon, keys)
+        split = split_by_episode(self.store, params, self.windows.horizon)
         sides = (np.isin(self.ticks, side) for side in (split.train, split.val))
         train, held_out = (Subset(self, np.flatnonzero(side).tolist()) for side in sides)
         return train, held_out
@@ -164,7 +149,7 @@ class UnifiedVLADataset(Dataset[Sample]):
             check_store(self.store, self.vlm_reuse_count, self.action_hz, self.action_rotation)
             self.episodes = tuple(
                 episodes_of_recordings(self.store, self._recordings())
-                if self._sources or self._given is not None
+                if self._sources
                 else episodes_of_format(self.store, self._format)
             )
         ranges = [np.arange(episode.ticks.start, episode.ticks.stop) for episode in self.episodes]
@@ -179,8 +164,6 @@ class UnifiedVLADataset(Dataset[Sample]):
         self.episodes = self.store.episodes
 
     def _recordings(self) -> Sequence[Recording]:
-        if self._given:
-            return self._given
         if not self._sources:
             raise ConfigError(
                 "a data set needs recordings or a store, found neither. Name a folder of "

@@ -81,7 +81,6 @@ def create_unified_dataloader(
     seed: int = 0,
     val_fraction: float = 0.0,
     pin_memory: bool = False,
-    multiprocessing_context: str | None = None,
     **settings: Any,
 ) -> DataLoader[Any]:
     """A loader of `UnifiedBatch`es that draws three new items for each old one.
@@ -91,8 +90,8 @@ def create_unified_dataloader(
 
     `settings` go to the `UnifiedVLADataset`, the loader's `dataset`. `val_fraction` of its episodes
     are never drawn: `loader.dataset.split(val_fraction)[1]` has them. The loader's `batch_sampler`
-    is the `MixtureBatches` that resumes a run. With only a `store`, episodes are old and new by
-    their formats. Raises as these classes do.
+    is the `MixtureBatches` that resumes a run. With only a `store`, episodes are old by their
+    format, all others new. Raises as these classes do.
     """
     old = named_sources(old_dataset_patterns, "old")
     sources = [*old, *named_sources(new_dataset_path or (), "new")]
@@ -109,19 +108,13 @@ def create_unified_dataloader(
         name: of_name[np.isin(of_name, np.array(drawn))]
         for name, of_name in dataset.items_by("source" if sources else "format").items()
     }
-    weights = {"old": old_weight, "new": new_weight}
-    if foreign := sorted(set(items) - set(weights)):
-        raise ConfigError(
-            f"the store has episodes of the formats {', '.join(foreign)} beside old and new ones, "
-            "which have no weight. Name old_dataset_patterns and new_dataset_path"
-        )
-    batches = MixtureBatches(items, {name: weights[name] for name in items}, batch_size, seed)
+    weights = {name: old_weight if name == "old" else new_weight for name in items}
+    batches = MixtureBatches(items, weights, batch_size, seed)
     return DataLoader(
         dataset,
         batch_sampler=batches,
         num_workers=num_workers,
         collate_fn=unified_collate_fn,
         pin_memory=pin_memory,
-        multiprocessing_context=multiprocessing_context if num_workers else None,
         persistent_workers=bool(num_workers),
     )

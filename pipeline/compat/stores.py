@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 from pipeline.base.differences import describe, differences
 from pipeline.base.errors import StoreMismatch
-from pipeline.base.source import row_key
 from pipeline.data import Recording
 from pipeline.data.episode import Frames, ReadEpisode, RowFrames, common_embodiment
 from pipeline.data.recording import absolute
@@ -89,7 +88,7 @@ def episodes_of_recordings(store: FeatureStore, recordings: Sequence[Recording])
 def store_in_memory(
     episodes: Sequence[ReadEpisode], action_hz: float | None, vlm_reuse_count: int
 ) -> tuple[FeatureStore, RowFrames]:
-    """These episodes as a store whose VL rows have no slots and no keys, and the rows' frames.
+    """These episodes as a store whose VL rows have no slots, and the rows' frames.
 
     It is not on disk: unpickling a data set reads the recordings again. Raises `StoreMismatch` if
     two recordings are not of one embodiment.
@@ -117,7 +116,7 @@ def store_in_memory(
     arrays |= {
         "vl/features": np.zeros((rows, 0, 0), np.float32),
         "vl/slot_valid": np.zeros((rows, 0), np.uint8),
-        "vl/key": np.zeros((rows, KEY_BYTES), np.uint8),
+        "vl/key": np.arange(2 * rows).view(np.uint8).reshape(rows, KEY_BYTES),
     }
     for name in ("sensor", "state"):
         streams = [stream for episode in episodes if (stream := getattr(episode, name))]
@@ -136,19 +135,6 @@ def read_frames(frames: RowFrames, rows: NDArray[np.int64]) -> dict[int, Frames]
     """
     ranges = frames.ranges(np.unique(rows))
     return {row: views for part in ranges for row, views in part.read()}
-
-
-def first_keys(frames: RowFrames) -> NDArray[np.uint8]:
-    """(row, 16) a digest of the frames of each episode's first row, 0 for other rows.
-
-    The split uses them in place of a store's keys, to recognise one recording in two formats.
-    """
-    keys = np.zeros((len(frames.frame_time), KEY_BYTES), np.uint8)
-    firsts = frames.vl_start[:-1][np.diff(frames.vl_start) > 0]
-    for row in firsts.tolist():
-        views = read_frames(frames, np.array([row]))[row]
-        keys[row] = np.frombuffer(row_key("", sorted(views), "", views), np.uint8)
-    return keys
 
 
 def _name(id: str) -> str:

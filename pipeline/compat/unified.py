@@ -111,31 +111,9 @@ class QwenVLAUnified(LivePolicy[LiveVLM]):
         sizes = (slots, feature_dim or width, sensor_channels, state_dim, action_dim)
         shape = PolicyShape(*sizes, action_groups=groups, views=len(names))
         policy = Policy(params, shape, normalization or no_normalization(shape))
-        self._assemble(policy, vlm_params, tuned, names)
-
-    @classmethod
-    def of(cls, policy: Policy, vlm: LiveVLM) -> "QwenVLAUnified":
-        """The model of a policy and a vision-language model.
-
-        Raises `VLMError` where their features differ in number or width, `CheckpointMismatch` where
-        a checkpoint's policy was trained on other features.
-        """
-        if policy.feature_spec is not None:
-            from pipeline.vlm.live import refuse_other_features
-
-            refuse_other_features(vlm.vlm, policy.feature_spec, vlm.spec)
-        model = cls.__new__(cls)
-        model._assemble(policy, vlm.vlm, vlm.tuning, vlm.spec.views)
-        vlm.check_shape(policy.shape.slots, policy.shape.feature_dim)
-        model.vlm = vlm
-        return model
-
-    def _assemble(
-        self, policy: Policy, vlm: VLMParams, tuning: TuningParams, views: Sequence[str]
-    ) -> None:
-        load = partial(_load, vlm, tuning, views, policy.shape)
-        super().__init__(policy, load, tuned=tuning.method != "none")
-        self.vlm_params, self.tuning = vlm, tuning
+        load = partial(_load, vlm_params, tuned, names, shape)
+        super().__init__(policy, load, tuned=tuned.method != "none")
+        self.vlm_params, self.tuning = vlm_params, tuned
 
     def __getstate__(self) -> dict[str, Any]:
         """Leave out the preparer, whose caches cannot be pickled; it is made again."""

@@ -14,9 +14,8 @@ from pipeline.base.config import Source, SplitParams, TrainHeadParams
 from pipeline.base.errors import ConfigError, RecordingError, StoreIncomplete, StoreMismatch
 from pipeline.base.observation import Observation
 from pipeline.compat.unified import QwenVLAUnified
-from pipeline.data import Channels, RecordedAction, open_recordings
+from pipeline.data import open_recordings
 from pipeline.data.timeline import build_timeline
-from pipeline.data.windowed import WindowedRecording
 from pipeline.datasets import (
     AsyncInsertionMeca500DatasetWithSensor,
     NewAsyncInsertionDataset,
@@ -126,7 +125,7 @@ class TestItems:
             again = unified_collate_fn([data[item] for item in items])
             assert isinstance(batch, Batch) and isinstance(batch, Observation)
             assert equal(batch, again)
-            assert equal(batch, unified_collate_fn(list(batch)))
+            assert equal(batch, unified_collate_fn([batch[i] for i in range(len(batch))]))
             with pytest.raises(IndexError):
                 batch[len(items)]
         with pytest.raises(StoreMismatch, match="1 of its 2 samples"):
@@ -222,41 +221,11 @@ class TestStore:
 
 
 class TestErrors:
-    def test_what_contradicts_itself(self, extracted: FeatureStore, recordings: Path) -> None:
+    def test_what_contradicts_itself(self, extracted: FeatureStore) -> None:
         with pytest.raises(ConfigError, match="recordings or a store"):
             UnifiedVLADataset()
-        with pytest.raises(ConfigError, match="recordings or a store"):
-            UnifiedVLADataset(recordings=[], store=extracted)
-        opened = open_recordings(sources(recordings)).recordings
-        for doubled in (
-            {"recordings": opened, "data": recordings},
-            {"recordings": opened, "instruction": "go"},
-            {"store": extracted, "views": ["View1"]},
-        ):
-            with pytest.raises(ConfigError, match="open already"):
-                UnifiedVLADataset(**doubled)
-        with pytest.raises(ConfigError, match="horizon=0"):
-            UnifiedVLADataset(recordings / "new", horizon=0)
-        wrong: Any = "newest"
-        with pytest.raises(ConfigError, match=r"action_rotation: .*rotvec.*'newest'"):
-            UnifiedVLADataset(recordings / "new", action_rotation=wrong)
-
-    def test_two_embodiments_are_refused_naming_both(self, recordings, monkeypatch):
-        """Of the same channels, but what they mean differs."""
-
-        def other(one: WindowedRecording) -> RecordedAction | None:
-            poses = one.poses()
-            if one.path.name != last or poses is None:
-                return None
-            names = ("dx", "dy", "dz", "rx", "ry", "rz", "gripper")
-            channels = Channels(names, ("mm",) * 3 + ("deg",) * 3 + ("",))
-            values = np.zeros((len(poses.time), 7), np.float32)
-            return RecordedAction(channels, poses.time, values, "absolute", None)
-
-        last = max(path.name for path in (recordings / "new" / "Red_point").iterdir())
-        monkeypatch.setattr(WindowedRecording, "action", other)
-        with pytest.raises(StoreMismatch, match=r"7 delta channels.*7 absolute channels.*Make two"):
-            UnifiedVLADataset(recordings / "new")
+        with pytest.raises(ConfigError, match="computed already"):
+            UnifiedVLADataset(store=extracted, views=["View1"])
 
     def test_what_is_not_there(self, tmp_path: Path, recordings: Path) -> None:
         with pytest.raises(RecordingError, match="nowhere"):
@@ -265,15 +234,6 @@ class TestErrors:
             AsyncInsertionMeca500DatasetWithSensor(recordings / "new")
         with pytest.raises(StoreIncomplete, match=r"nowhere\.zarr"):
             UnifiedVLADataset(store=tmp_path / "nowhere.zarr")
-
-    def test_every_broken_episode_is_named(self, copied) -> None:
-        folder = copied("new")
-        for metadata in folder.glob("**/metadata.json"):
-            metadata.write_text("{")
-        with pytest.raises(
-            RecordingError, match=r"(?s)2 episodes.*_092140/metadata.*_092320/metadata"
-        ):
-            UnifiedVLADataset(folder)
 
 
 class TestSplit:
@@ -326,17 +286,6 @@ class TestWorkers:
         )
         for batch, items in zip(loader, loader.batch_sampler, strict=True):
             assert equal(batch, new.__getitems__(items))
-
-    def test_recordings_that_are_open_already_are_the_same_data(
-        self, recordings, extracted, live, cached
-    ):
-        opened = open_recordings(sources(recordings)).recordings
-        for ours, theirs in (
-            (UnifiedVLADataset(recordings=opened), live),
-            (UnifiedVLADataset(recordings=opened, store=extracted), cached),
-        ):
-            assert len(ours) == len(theirs) and equal(ours[3], theirs[3])
-            assert equal(pickle.loads(pickle.dumps(ours))[3], theirs[3])
 
     def test_a_pickle_opens_the_data_again(self, live, cached):
         for data in (live, cached):

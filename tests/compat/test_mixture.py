@@ -37,12 +37,6 @@ class TestShares:
         assert abs(of_old - 56 / 4) <= 1 + 1e-9
         assert abs(sum(item < old for item in drawn.batch(step)) - 7 / 4) <= 1 + 1e-9
 
-    def test_every_item_of_a_source_comes_before_one_comes_twice(self):
-        drawn = batches({"old": 20, "new": 30}, old=1.0, new=3.0)
-        new = [item for step in range(40) for item in drawn.batch(step) if item >= 20]
-        assert sorted(new[:30]) == list(range(20, 50))
-        assert sorted(new[30:60]) == list(range(20, 50))
-
     def test_a_weight_of_0_leaves_a_source_out(self):
         drawn = batches({"old": 20, "new": 30}, old=0.0, new=3.0)
         assert min(drawn.batch(5)) >= 20
@@ -85,11 +79,6 @@ class TestResume:
         drawn.first_step = 2  # resumed where it was broken off
         assert list(drawn) == whole[2:8]
 
-    def test_another_seed_is_another_order(self):
-        items = {"all": np.arange(50)}
-        orders = [MixtureBatches(items, {}, 10, seed).batch(0) for seed in (0, 0, 1)]
-        assert orders[0] == orders[1] != orders[2]
-
 
 @pytest.fixture(scope="module")
 def loader(recordings: Path) -> Any:
@@ -122,16 +111,6 @@ class TestLoader:
         items = loader.batch_sampler.batch(0)
         assert torch.equal(batch.action, loader.dataset.__getitems__(items).action)
         assert batch.features.shape[1:] == extracted.feature_shape
-
-    def test_formats_without_a_weight_are_refused(self, tiny_store: Any, tmp_path: Path) -> None:
-        path = tiny_store(tmp_path)
-        loader = create_unified_dataloader(store=path, batch_size=8)
-        assert len(next(iter(loader))) == 8
-        raw = FeatureStore.open(path)
-        for index in range(len(raw.episodes)):
-            object.__setattr__(raw.episodes[index], "format", "raw")
-        with pytest.raises(ConfigError, match="raw"):
-            create_unified_dataloader(store=raw)
 
     def test_held_out_episodes_are_never_drawn(self, recordings: Path) -> None:
         loader = create_unified_dataloader(

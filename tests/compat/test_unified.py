@@ -1,12 +1,9 @@
 """One model, live or cached: the same answer, the arguments it has always had, and it learns."""
 
-import copy
-import json
 import pickle
-import shutil
 import subprocess
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -18,22 +15,17 @@ from PIL import Image
 from pydantic import ValidationError
 from torch import Tensor
 
-from pipeline.base.config import TrainHeadParams, TuningParams, VLMParams
-from pipeline.base.digests import file_digest
-from pipeline.base.errors import CheckpointMismatch, ObservationError, VLMError
+from pipeline.base.errors import ObservationError
 from pipeline.compat.unified import (
     Not_freeze_QwenVLAWithSensor,
     QwenVLAUnified,
     QwenVLAWithSensor,
     QwenVLAWithSensorDiffusion,
-    no_normalization,
 )
-from pipeline.policy.checkpoint import PolicyCheckpoint
 from pipeline.policy.expert import Guide
 from pipeline.policy.observation import LiveObservation, PolicyShape
-from pipeline.policy.policy import Policy, Trainable
-from pipeline.vlm.feature_spec import feature_spec
-from pipeline.vlm.live import LiveVLM, live_spec
+from pipeline.policy.policy import Trainable
+from pipeline.vlm.live import live_spec
 from pipeline.vlm.preparation import Preparer
 from pipeline.vlm.qwen import FrozenVLM
 
@@ -59,12 +51,6 @@ SMALL: dict[str, Any] = {
 @pytest.fixture(autouse=True)
 def _seeded() -> None:
     torch.manual_seed(0)
-
-
-def small_policy(shape: PolicyShape) -> Policy:
-    """A policy of the sizes of `SMALL`, without normalization."""
-    sizes = {name: value for name, value in SMALL.items() if name in TrainHeadParams.model_fields}
-    return Policy(TrainHeadParams.model_validate(sizes), shape, no_normalization(shape))
 
 
 @pytest.fixture
@@ -311,95 +297,6 @@ def test_a_state_dict_restores_it_in_a_fresh_model(build, images, finetune_vl):
         restored.load_state_dict({})
 
 
-def test_of_two_parts(build: Make, images: list[Any]) -> None:
-    whole = build(finetune_vl="lora")
-    vlm = whole.load_vlm()
-    model = QwenVLAUnified.of(whole.policy, vlm).eval()
-    assert (model.policy, model.vlm) == (whole.policy, vlm)
-    rows, row_of = Preparer(vlm.vlm, vlm.spec).prepare_distinct(images, TEXT)
-    assert (len(rows), row_of) == (3, [0, 1, 0, 2])
-    torch.manual_seed(0)
-    expected = whole(images, TEXT)
-    torch.manual_seed(0)
-    assert torch.equal(model(images, TEXT), expected)
-
-    memo = {id(p): p for p in model.parameters() if not p.requires_grad}
-    shared = set(memo)
-    twin = copy.deepcopy(model, memo)
-    torch.manual_seed(0)
-    assert torch.equal(twin(images, TEXT), expected)
-    assert {id(p) for p in twin.parameters()} & {id(p) for p in model.parameters()} == shared
-
-    other = small_policy(PolicyShape(5, 16, 9, 12, 7, ("other",) * 7))
-    with pytest.raises(VLMError, match=r"gives 3 feature slots of width 128.* for 5 of width 16"):
-        QwenVLAUnified.of(other, vlm)
-    with pytest.raises(VLMError, match="feature_dim=128"):
-        build(feature_dim=2048).load_vlm()
-
-
-SEEN = VLMParams(
-    checkpoint="of the test",
-    dtype="float32",
-    image_resize_height=56,
-    image_resize_width=84,
-    pooling=("mean", "view_mean"),
-)
-
-
-@pytest.fixture
-def trained(demo_checkpoint: Path) -> Any:
-    """`trained(storage_dtype, **vlm)`: a policy of a checkpoint, of features stored so."""
-
-    def policy(storage_dtype: str, **changed: Any) -> Policy:
-        vlm = SEEN.model_copy(update={"checkpoint": str(demo_checkpoint), **changed})
-        spec = feature_spec(vlm, storage_dtype, VIEWS, file_digest)
-        shape = PolicyShape(len(spec.slots), spec.dim, 9, 12, 7, ("other",) * 7)
-        fresh = small_policy(shape)
-        source = {"feature_spec": json.loads(json.dumps(spec.attrs()))}
-        weights = fresh.state_dict()
-        return PolicyCheckpoint(
-            fresh.params, shape, no_normalization(shape), source, {}, 1, weights
-        ).policy()
-
-    return policy
-
-
-def _live(vlm: VLMParams, views: Sequence[str] = VIEWS) -> LiveVLM:
-    """A model that says what it would compute."""
-    tuning = TuningParams(method="none")
-    return LiveVLM(torch.nn.Identity(), None, live_spec(vlm, views), vlm, tuning)  # type: ignore
-
-
-@pytest.mark.parametrize(
-    ("live", "views", "message"),
-    [
-        ({}, ("View1", "View3"), r'views: \["View1", "View2"\] -> \["View1", "View3"\]'),
-        ({"dtype": "bfloat16"}, VIEWS, 'compute_dtype: "float32" -> "bfloat16"'),
-    ],
-)
-def test_a_live_model_of_other_features_than_the_policy_s_is_refused(
-    trained, demo_checkpoint, live, views, message
-):
-    vlm = SEEN.model_copy(update={"checkpoint": str(demo_checkpoint), **live})
-    with pytest.raises(CheckpointMismatch, match=message):
-        QwenVLAUnified.of(trained("float32"), _live(vlm, views))
-
-
-def test_a_live_model_of_other_weights_is_refused(trained, demo_checkpoint, tmp_path):
-    other = shutil.copytree(demo_checkpoint, tmp_path / "other")
-    vlm = SEEN.model_copy(update={"checkpoint": str(other)})
-    policy = trained("bfloat16", variants=2)
-    # Neither the place of the weights nor how features are stored is part of what they are.
-    assert QwenVLAUnified.of(policy, _live(vlm)).policy is policy
-    weights = other / "model.safetensors"
-    content = bytearray(weights.read_bytes())
-    content[-1] ^= 1
-    weights.write_bytes(content)
-    with pytest.raises(CheckpointMismatch, match=r'weights: ".*" -> ".*"') as refused:
-        QwenVLAUnified.of(policy, _live(vlm))
-    assert len(str(refused.value).splitlines()) == 3, "nothing else differs"
-
-
 def test_the_arguments_it_has_always_had() -> None:
     model = QwenVLAUnified()
     params, shape = model.policy.params, model.policy.shape
@@ -422,12 +319,6 @@ def test_the_arguments_it_has_always_had() -> None:
     assert (vlm.image_resize_height, vlm.image_resize_width) == (360, 640)
     chunk = model.eval()(features=torch.randn(2, 1, 2048), sensor=torch.randn(2, 650, 1026))
     assert chunk.shape == (2, 8, 7)
-
-
-def test_a_part_that_is_named_in_part_keeps_the_rest_of_it(build: Make) -> None:
-    params = build(expert={"dim": 32, "heads": 2}, state_encoder={"dim": 16}).policy.params
-    assert (params.expert.dim, params.expert.heads, params.expert.layers) == (32, 2, 4)
-    assert (params.state_encoder.dim, params.state_encoder.output_dim) == (16, 512)
 
 
 @pytest.mark.parametrize(

@@ -4,15 +4,9 @@ A case is known by the suite's seed and its number alone. `make`, `run` and `jud
 process of their own.
 """
 
-import hashlib
-import json
 import os
 import shutil
-import subprocess
-import sys
-from collections.abc import Callable
-from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 from importlib import import_module
 from pathlib import Path
@@ -20,12 +14,11 @@ from random import Random
 
 import yaml
 
-from pipeline.store.chunks import note_metadata
 from stages.command import run
 from tests.fuzz import oracle
 from tests.fuzz.corpus import ARCHIVE, HEAD, REAL, RECORDINGS, STORE, params
 from tests.fuzz.hostile import CANARY, HOSTILE
-from tests.fuzz.mutations import Change, change_any, rewrite
+from tests.fuzz.mutations import Change, change_any
 
 ROOT = Path(__file__).parents[2]
 _PARTS = {"read": "extract", "load": "evaluate"}
@@ -60,8 +53,6 @@ TURN = (["recordings"] * 9 + ["VLM folders"] * 2 + ["adapters"] * 2 + ["stores"]
 )
 """The classes of the cases, over and over."""
 CLASSES = tuple(dict.fromkeys(TURN))
-_BY_SHELL = ("archives", "recordings", "stores", "trained heads")
-"""Classes of which a case, in the second turn, runs as a user runs it, which takes seconds."""
 
 
 @dataclass(frozen=True)
@@ -73,8 +64,6 @@ class Case:
     corpus: Path
     whole: tuple[str, str] | None = None
     """The thing and the stage of a case in which nothing is changed."""
-    fault: Callable[[], object] = lambda: None
-    """What breaks the pipeline first."""
     seconds: float = 10.0
     """Of processor time that it may take; and six times as long by the clock."""
 
@@ -110,21 +99,11 @@ class Case:
         """What is changed."""
         return SUBJECTS[self.thing]
 
-    @property
-    def by_shell(self) -> bool:
-        """Whether the command runs as a user runs it."""
-        second = self.turn == TURN.count(self.kind)
-        return not self.whole and second and self.kind in _BY_SHELL
-
     @cached_property
     def stage(self) -> str:
         """What reads it."""
-        stage = (
-            self.whole[1]
-            if self.whole
-            else Random(f"{self.seed}-{self.number}-stage").choice(self.subject.stages)
-        )
-        return _PARTS.get(stage, stage) if self.by_shell else stage
+        drawn = Random(f"{self.seed}-{self.number}-stage")
+        return self.whole[1] if self.whole else drawn.choice(self.subject.stages)
 
     @property
     def folder(self) -> Path:
@@ -172,23 +151,13 @@ class Case:
             paths = sorted(path for path in self.folder.rglob(pattern) if path.is_file())
             path = self.rng.choice(paths)
             act(path)
-            permits = permitted[0] if permitted else "any" if what == "an AVI" else "refuse"
+            permits = permitted[0] if permitted else "refuse"
             sound = self.subject.kind != "recordings" and what != "a terabyte"
             return Change(what, path, permits, sound=sound or bool(permitted))
-        change = change_any(self.rng, self.place, self.corpus / "other" / self.subject.place)
-        sealed = change.path.name in ("zarr.json", "policy.json") and change.path.is_file()
-        if sealed and self.rng.random() < 0.6:
-            with suppress(Exception):  # of what is no document any more
-                _seal(self.place, change.path)
-                return replace(change, what=f"{change.what}, with a digest that fits", sealed=True)
-        return change
+        return change_any(self.rng, self.place, self.corpus / "other" / self.subject.place)
 
     def run(self) -> int:
         """The exit code of the command, whose messages go to this process's stderr."""
-        if self.by_shell:
-            environment = os.environ | {"PYTHONPATH": str(ROOT)}
-            command = [sys.executable, *self.command[1:]]
-            return subprocess.run(command, env=environment, check=False).returncode
         parts = {"read": oracle.read_all, "load": oracle.load_head}
         return run(
             "", parts.get(self.stage) or import_module(f"stages.{self.stage}").main, self.arguments
@@ -202,18 +171,6 @@ class Case:
             return oracle.judge(self, change)
         except Exception as error:
             return f"its judge cannot read it: {type(error).__name__}: {error!s:.300}"
-
-
-def _seal(place: Path, path: Path) -> None:
-    """Give a changed document of a store, an archive or a head the digest of what it says now."""
-    if path.name == "zarr.json":
-        return note_metadata(place)
-    document = json.loads(path.read_bytes())
-    document.pop("document_sha256", None)
-    text = json.dumps(document, sort_keys=True, separators=(",", ":"), allow_nan=False)
-    document["document_sha256"] = hashlib.sha256(text.encode()).hexdigest()
-    rewrite(path, json.dumps(document).encode())
-    return None
 
 
 def wholes(corpus: Path) -> list[Case]:

@@ -12,19 +12,17 @@ import os
 import pickle
 import shutil
 import struct
-import zlib
+import zipfile
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-import av
 import numpy as np
-import pyarrow.parquet as pq
 import zarr
 from PIL import Image
 
-from tests.fuzz.mutations import Permit, in_mode, rewrite, with_column
+from tests.fuzz.mutations import Permit, rewrite
 
 CANARY = "canary"
 Act = Callable[[Path], object]
@@ -68,34 +66,15 @@ def _sparse(path: Path) -> None:
     os.truncate(path, 2**40)
 
 
-def _zeros(gigabytes: int, rows: int) -> Act:
-    """An npz of one member that says it has that many rows, and unpacks to that many zeros."""
-
-    def act(path: Path) -> None:
-        with np.load(path) as archive:
-            name = archive.files[-1]
-        header = f"{{'descr': '<f4', 'fortran_order': False, 'shape': ({rows}, 2)}}\n".encode()
+def _lying(path: Path) -> None:
+    """An npz of one member that says it has 10**12 rows."""
+    with np.load(path) as archive:
+        name = archive.files[-1]
+    header = b"{'descr': '<f4', 'fortran_order': False, 'shape': (1000000000000, 2)}\n"
+    path.unlink()
+    with zipfile.ZipFile(path, "w") as archive:
         head = b"\x93NUMPY\x01\x00" + struct.pack("<H", len(header)) + header
-        rewrite(path, _zip(f"{name}.npy".encode(), head, gigabytes * 2**30))
-
-    return act
-
-
-def _zip(name: bytes, head: bytes, zeros: int) -> bytes:
-    """A zip with one member, which is `head` and then that many zeros (a multiple of 2 MiB)."""
-    packer = zlib.compressobj(9, zlib.DEFLATED, -15)
-    body = packer.compress(head) + packer.flush(zlib.Z_FULL_FLUSH)
-    block = packer.compress(bytes(2**21)) + packer.flush(zlib.Z_FULL_FLUSH)
-    body += block * (zeros // 2**21) + packer.flush()
-    # Sizes stand in the 64-bit extra field, and the checksum, which is asked last, is wrong.
-    extra = struct.pack("<HHQQ", 1, 16, len(head) + zeros, len(body))
-    common = struct.pack("<5H", 45, 0, 8, 0, 0)
-    common += struct.pack("<IIIHH", 1, 2**32 - 1, 2**32 - 1, len(name), len(extra))
-    local = b"PK\x03\x04" + common + name + extra + body
-    entry = b"PK\x01\x02\x2d\0" + common + bytes(14) + name + extra
-    return (
-        local + entry + b"PK\x05\x06" + struct.pack("<4HIIH", 0, 0, 1, 1, len(entry), len(local), 0)
-    )
+        archive.writestr(f"{name}.npy", head)
 
 
 def _elsewhere(absolute: bool) -> Act:
@@ -134,16 +113,6 @@ def _list(text: str) -> Act:
     return act
 
 
-def _movie(codec: str, kind: str, width: int, height: int, pixels: str, path: Path) -> None:
-    path.unlink()
-    with av.open(str(path), "w", format=kind) as container:
-        stream = container.add_stream(codec, rate=10)
-        stream.width, stream.height, stream.pix_fmt = width, height, pixels
-        for _ in range(7 if width < 100 else 1):
-            container.mux(stream.encode(av.VideoFrame(width, height, pixels)))
-        container.mux(stream.encode())
-
-
 def _image(kind: str, size: int, path: Path) -> None:
     buffer = io.BytesIO()
     Image.new("L", (size, size)).save(buffer, kind)
@@ -171,13 +140,6 @@ def _frames(change: Callable[[int, Path], Path]) -> Act:
     return act
 
 
-def _png(_: int, frame: Path) -> Path:
-    with Image.open(frame) as picture:
-        picture.save(frame.with_suffix(".png"))
-    frame.unlink()
-    return frame.with_suffix(".png")
-
-
 def _numbered(number: int, frame: Path) -> Path:
     return frame.rename(frame.with_name(f"{number + 1:06d}.jpg"))
 
@@ -189,39 +151,12 @@ def _twin(_: int, frame: Path) -> Path:
     return frame
 
 
-def _lower(frame: Path) -> None:
-    frame.parent.rename(frame.parents[1] / frame.parent.name.lower())
-
-
-def _grey(path: Path) -> None:
-    rewrite(path, in_mode(path.read_bytes(), "I;16"))
-
-
-def _grey_cells(path: Path) -> None:
-    """Likewise of the images in the rows of a table."""
-    table, name = pq.ParquetFile(path).read(), "observation.images.top"
-    rows = [{**row, "bytes": in_mode(row["bytes"], "I;16")} for row in table[name].to_pylist()]
-    path.unlink()
-    pq.write_table(with_column(table, name, rows), path)
-
-
 def _in_place_of(other: str) -> Act:
     """Link the chunk of another array of a store in the place of one's."""
 
     def act(path: Path) -> None:
         (path.parent / "c/0").unlink()
         os.link(path.parents[2] / other / "c/0", path.parent / "c/0")
-
-    return act
-
-
-def _exchanged(other: str) -> Act:
-    """Exchange the chunks of two arrays of a store."""
-
-    def act(path: Path) -> None:
-        data = (path.parent / "c/0").read_bytes()
-        _in_place_of(other)(path)
-        rewrite(path.parents[2] / other / "c/0", data)
 
     return act
 
@@ -250,16 +185,10 @@ class _Runs:
         return os.system, (f"touch {CANARY}",)
 
 
-_NUMPY = b"\x80\x04cnumpy\ndtype\n%sR."
 PICKLES = {
-    "2 MB of empty lists in lists": b"\x80\x04" + b"]" * 2**20 + b"a" * (2**20 - 1) + b".",
-    "a text of a dtype": _NUMPY % (b"X" + struct.pack("<I", 10**6) + b"f" * 10**6 + b"\x85"),
     "a command": pickle.dumps({"action": _Runs()}),
     "a command as an extension": b"\x80\x02\x82\x01.",
     "a global by the stack": b"\x80\x04\x8c\x02os\x8c\x06system\x93\x8c\x0ctouch canary\x85R.",
-    "an object without end": b"\x80\x04(" * 10**6 + b".",
-    "100,000 memo entries": b"\x80\x04]%b."
-    % b"".join(b"r" + struct.pack("<I", i) for i in range(10**5)),
     "decimal digits": b"I" + b"9" * 10**6 + b"\n.",
 }
 _MAPPED = _set(auto_map={"AutoConfig": "evil.Evil", "AutoModel": "evil.Evil"})
@@ -270,19 +199,13 @@ _INFO, _CONFIG, _TOKENS = "meta/info.json", "config.json", "tokenizer_config.jso
 _PIXELS, _WEIGHTS, _LORA = "preprocessor_config.json", "model.safetensors", "adapter_config.json"
 
 ACCIDENTS: list[tuple[str, str, str, Act, Permit]] = [
-    *((name, "View1/*.jpg", "PNGs", _frames(_png), "same") for name in ("raw", "new")),
-    ("raw", "View5/*.jpg", "one PNG", _frames(lambda n, f: f if n else _png(n, f)), "same"),
     ("old", "View1/left/*.jpg", "numbers", _frames(_numbered), "refuse"),
     *((name, "View1/*.jpg", "two cameras", _frames(_twin), "refuse") for name in ("raw", "new")),
-    *((name, "View1/*.jpg", "view1/", _lower, "same") for name in ("raw", "new")),
     ("new", "View2/*.jpg", "no View2", lambda path: shutil.rmtree(path.parent), "refuse"),
     ("new", "View2/*.jpg", "no images/", lambda path: shutil.rmtree(path.parents[1]), "refuse"),
     ("lerobot_v21", _INFO, "fps of 30", _set(fps=30), "refuse"),
     ("lerobot_images", _INFO, "fps of 5", _set(fps=5), "refuse"),
-    ("raw", "*.jpg", "grey of 16 bits", _grey, "any"),
-    ("lerobot_images", "data/*/*.parquet", "grey of 16 bits", _grey_cells, "any"),
     ("store", "sensor/time/zarr.json", "a link", _in_place_of("state/time"), "refuse"),
-    ("store", "sensor/time/zarr.json", "an exchange", _exchanged("state/time"), "refuse"),
     ("store", "tick/action/zarr.json", "an older chunk", _backwards("tick/action"), "refuse"),
     (
         "store",
@@ -308,12 +231,9 @@ HOSTILE: list[tuple[str, str, str, Act] | tuple[str, str, str, Act, Permit]] = [
         (f"lerobot_v{version}", "*.mp4", f"a list of neighbours: {text[:9]}", _list(text))
         for version, text in ((21, _PLAYLIST), (21, _CONCAT), (30, _CONCAT))
     ),
-    ("lerobot_v21", "*.mp4", "MJPEG", partial(_movie, "mjpeg", "mp4", 12000, 12000, "yuvj420p")),
-    ("lerobot_v21", "*.mp4", "an AVI", partial(_movie, "mpeg4", "avi", 64, 48, "yuv420p")),
     ("new", "*.jpg", "a real JPEG of 12,500 x 12,500", partial(_image, "JPEG", 12500)),
     ("old", "*.jpg", "a PNG of 12,500 x 12,500", partial(_image, "PNG", 12500)),
-    *((name, "*.npz", "6 GiB", _zeros(6, 6 * 2**27)) for name in ("raw", "new", "lerobot_images")),
-    *((name, "*.npz", "10**12 rows", _zeros(0, 10**12)) for name in ("raw", "new")),
+    *((name, "*.npz", "10**12 rows", _lying) for name in ("raw", "new", "lerobot_images")),
     ("vlm", _CONFIG, "code of its own", _MAPPED),
     ("vlm", _TOKENS, "code of its own", _MAPPED),
     ("vlm", _PIXELS, "10**12 pixels", _set(min_pixels=10**12, max_pixels=10**13)),

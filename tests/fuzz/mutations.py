@@ -39,8 +39,6 @@ class Change:
     """Its place in a document."""
     sound: bool = False
     """Whether the file is still one of its kind: what it contradicts may be named in its place."""
-    sealed: bool = False
-    """Whether the digest that its format has was made to fit."""
 
 
 class Edited(NamedTuple):
@@ -177,19 +175,13 @@ def edit_csv(rng: Random, data: bytes) -> Edited:
     rows = list(csv.reader(io.StringIO(data.decode())))
     line, column = rng.randrange(1, len(rows)), rng.randrange(len(rows[0]))
     what = f"line {line + 1}, column {rows[0][column]}: "
-    match rng.choice(["cell"] * 5 + ["no column", "name", "twin", "no line", "order", "cut"]):
+    match rng.choice(["cell"] * 5 + ["no column", "no line", "order", "cut"]):
         case "cell":
             rows[line][column] = rng.choice([*CELLS, "x" * 200_000])
             what += f"the cell is {rows[line][column][:20]!r}"
         case "no column":
             rows = [row[:column] + row[column + 1 :] for row in rows]
             what += "no such column"
-        case "name":
-            rows[0][column] = rng.choice(["", "other", rows[0][column].upper(), "\ufeff"])
-            what += "another name"
-        case "twin":
-            rows = [[*row, row[column]] for row in rows]
-            what += "there twice"
         case "no line":
             del rows[line]
             what += "no such line"
@@ -240,21 +232,15 @@ def edit_npz(rng: Random, data: bytes) -> Edited:
     with np.load(io.BytesIO(data)) as archive:
         members = dict(archive)
     name, permits, buffer = rng.choice(list(members)), "any", io.BytesIO()
-    match rng.choice(["array"] * 6 + ["drop", "more", "rename", "single"]):
+    match rng.choice(["array"] * 6 + ["drop", "more"]):
         case "array":
             members[name], what = _other_array(rng, members[name])
         case "drop":
             del members[name]
             what = "is dropped"
-        case "more":
+        case _:
             members["nobody_knows"], permits = np.array([{}], object), "same"
             what = "has an unknown neighbour of objects"
-        case "rename":
-            members[rng.choice(["../../x", "/tmp/x", "a\0b", "é", ""])] = members.pop(name)
-            what = "has another name"
-        case _:
-            np.save(buffer, members[name])
-            return Edited(buffer.getvalue(), f"{name!r} stands alone", sound=False)
     np.savez(buffer, **members)
     return Edited(buffer.getvalue(), f"member {name!r} {what}", permits, name)
 
@@ -295,10 +281,7 @@ def edit_parquet(rng: Random, data: bytes) -> Edited:
     rows, wrong = table[name].to_pylist(), rng.choice(CONSTANTS)
     images = ["image"] * 20 * isinstance(table[name].type, pa.StructType)
     match rng.choice(
-        images
-        + ["all"] * 4
-        + ["last"] * 3
-        + ["shift", "of another", "drop", "twin", "rows", "row", "order", "lie"]
+        images + ["all"] * 4 + ["last"] * 3 + ["drop", "twin", "rows", "row", "order"]
     ):
         case "image":
             edited = edit_image(rng, rows[-1]["bytes"])
@@ -312,15 +295,6 @@ def edit_parquet(rng: Random, data: bytes) -> Edited:
                 wrong = rng.choice([[wrong] * len(rows[-1]), rows[-1] * 2])
             table = with_column(table, name, [*rows[:-1], wrong])
             what = f"column {name!r} ends with {wrong!r:.99}"
-        case "shift" if spans := [name for name in names if name.endswith("_timestamp")]:
-            by = rng.choice([0.02, 0.06, 0.1])  # of a second, at 10 fps
-            for name in spans:
-                table = with_column(table, name, [row + by for row in table[name].to_pylist()])
-            what = f"all its spans of videos are {by} s late"
-        case "of another":
-            other = rng.choice(names)
-            table = with_column(table, name, table[other].to_pylist()[::-1])
-            what = f"column {name!r} is {other!r} backwards"
         case "drop":
             table, what = table.drop_columns([name]), f"column {name!r} is dropped"
         case "twin":
@@ -330,10 +304,8 @@ def edit_parquet(rng: Random, data: bytes) -> Edited:
             table, what = pa.concat_tables([table, table]), "all rows are there twice"
         case "row":
             table, what = table.slice(1), "the first row is dropped"
-        case "order":
-            table, what = table.take(list(range(len(rows)))[::-1]), "rows are backwards"
         case _:
-            return Edited(_lying_footer(data, len(rows)), "10**12 rows by its footer", sound=False)
+            table, what = table.take(list(range(len(rows)))[::-1]), "rows are backwards"
     buffer = io.BytesIO()
     pq.write_table(table, buffer)
     return Edited(buffer.getvalue(), what, key=name)
@@ -347,50 +319,21 @@ def with_column(table: pa.Table, name: str, rows: list[Any]) -> pa.Table:
     return table.set_column(table.column_names.index(name), name, column)
 
 
-def _lying_footer(data: bytes, rows: int) -> bytes:
-    """A parquet file whose footer counts 10**12 rows: numbers stand there in zigzag varints."""
-
-    def varint(number: int) -> bytes:
-        number, digits = 2 * number, b""
-        while number > 127:
-            digits, number = digits + bytes([number % 128 + 128]), number // 128
-        return digits + bytes([number])
-
-    length = struct.unpack("<I", data[-8:-4])[0]
-    footer = data[-8 - length : -8].replace(b"\x16" + varint(rows), b"\x16" + varint(10**12), 1)
-    return data[: -8 - length] + footer + struct.pack("<I", len(footer)) + data[-4:]
-
-
-IMAGES = ("GIF", "BMP", "TIFF", "PPM", "ICO", "WEBP", "PCX", "TGA", "SGI", "EPS", "PDF", "DDS")
-IMAGES += ("PNG", "JPEG")
-MODES = {"L": "JPEG", "CMYK": "JPEG", "1": "PNG", "LA": "PNG", "P": "PNG", "I;16": "PNG"}
-MODES |= {"F": "TIFF"}
-"""Modes of pixels, and a format that holds them."""
+IMAGES = ("GIF", "BMP", "TIFF", "WEBP", "PDF", "PNG", "JPEG")
 
 
 def edit_image(rng: Random, data: bytes) -> Edited:
     """Another size in a JPEG's header, or an image of another format or mode."""
-    sizes = ["size"] * data.startswith(b"\xff\xd8")
-    kind = rng.choice([*sizes, *IMAGES, *MODES, "1x1"])
-    if kind == "size":
+    kind = rng.choice(["size", *IMAGES, "L", "CMYK"])
+    if kind == "size" and data.startswith(b"\xff\xd8"):
         size = rng.choice([(0, 0), (65500, 65500), (12500, 12500), (1, 1)])
         return Edited(resized(data, *size), f"says to have {size} pixels")
-    if kind in MODES:
-        return Edited(in_mode(data, kind), f"is of mode {kind}")
     picture, buffer = Image.open(io.BytesIO(data)).convert("RGB"), io.BytesIO()
-    if kind == "1x1":
-        picture = picture.resize((1, 1))
-    picture.save(buffer, kind if kind in IMAGES else "JPEG")
+    if kind in IMAGES:
+        picture.save(buffer, kind)
+    else:
+        picture.convert("RGB" if kind == "size" else kind).save(buffer, "JPEG")
     return Edited(buffer.getvalue(), f"is {kind}")
-
-
-def in_mode(data: bytes, mode: str) -> bytes:
-    """The same image in another mode of pixels."""
-    picture, buffer = Image.open(io.BytesIO(data)).convert("RGB"), io.BytesIO()
-    if mode == "I;16":  # to which Pillow converts without using the upper eight bits
-        picture = Image.fromarray(np.asarray(picture.convert("L")).astype(np.uint16) * 257)
-    picture.convert(mode).save(buffer, MODES[mode])
-    return buffer.getvalue()
 
 
 def resized(data: bytes, height: int, width: int) -> bytes:
@@ -409,36 +352,25 @@ def _flipped(rng: Random, data: bytes, times: int) -> bytes:
     return bytes(changed)
 
 
-def _inserted(rng: Random, data: bytes, what: bytes, instead: int = 0) -> bytes:
+def _inserted(rng: Random, data: bytes, what: bytes) -> bytes:
     at = rng.randrange(len(data) or 1)
-    return data[:at] + what[: len(data) - at if instead else None] + data[at + instead :]
+    return data[:at] + what + data[at:]
 
 
 Edit = Callable[[Random, bytes], bytes]
 BYTES: dict[str, Edit] = {
     "cut off": lambda rng, data: data[: rng.randrange(len(data) or 1)],
-    "cut at its end": lambda rng, data: data[: -rng.choice([1, 2, 8])],
     "empty": lambda rng, data: b"",
     "a bit flipped": lambda rng, data: _flipped(rng, data, 1),
     "ten bits flipped": lambda rng, data: _flipped(rng, data, 10),
-    "a bit of its head flipped": lambda rng, data: _flipped(rng, data[:64], 1) + data[64:],
-    "a bit of its tail flipped": lambda rng, data: data[:-128] + _flipped(rng, data[-128:], 1),
-    "zeros inside": lambda rng, data: _inserted(
-        rng, data, bytes(n := rng.choice([1, 16, 4096])), n
-    ),
-    "all zeros": lambda rng, data: bytes(len(data)),
     "grown by zeros": lambda rng, data: data + bytes(rng.choice([1, 4096])),
-    "twice itself": lambda rng, data: data + data,
-    "its head twice": lambda rng, data: data[: len(data) // 2] + data,
     "noise": lambda rng, data: rng.randbytes(min(len(data), 5000)),
     "a Git LFS pointer": lambda rng, data: b"version https://git-lfs.github.com/spec/v1\n",
 }
 TEXT: dict[str, Edit] = {
     "with a byte order mark": lambda rng, data: b"\xef\xbb\xbf" + data,
     "in UTF-16": lambda rng, data: data.decode().encode("utf-16"),
-    "in UTF-32": lambda rng, data: data.decode().encode("utf-32"),
     "with a byte that is no UTF-8": lambda rng, data: _inserted(rng, data, b"\xe9"),
-    "with a NUL": lambda rng, data: _inserted(rng, data, b"\0"),
     "with Windows' line ends": lambda rng, data: data.replace(b"\n", b"\r\n"),
     "with empty lines at its end": lambda rng, data: data + b"\n\n",
 }

@@ -6,7 +6,6 @@ may be others where they are called by another name.
 """
 
 import json
-import os
 import pickle
 import re
 from contextlib import closing
@@ -162,15 +161,8 @@ def _taken(case: "Case", found: Any, before: Any, change: Change, why: str) -> s
             return strange
         case "recordings":
             return ""
-        case "trained heads" if change.sealed and case.stage == "load":
-            said = json.loads((case.place / "best/policy.json").read_bytes())
-            del said["document_sha256"]
-            for of_a_run in ("feed", "loggers", "scratch"):
-                said["params"]["train_head"].pop(of_a_run, None)
-            return differ("", said, found["document"], partly=True)
-        case _:  # a sealed document may say something else, but nothing of another type
-            compared = change.key.startswith("attributes.feature_spec.")  # and not used
-            return strange * (not compared) if change.sealed else why
+        case _:
+            return why
 
 
 def _without_frames(episodes: dict[str, Episode]) -> dict[str, Episode]:
@@ -191,34 +183,23 @@ def _not_stored(episodes: dict[str, Episode], store: Path) -> str:
     return ""
 
 
-def differ(where: str, said: Any, taken: Any, partly: bool = False) -> str:
-    """The first place at which two documents of objects, lists, arrays and values differ.
-
-    `partly`: what was taken may have more keys, and values where nothing was said.
-    """
-    if partly and said is None:
-        return ""
+def differ(where: str, said: Any, taken: Any) -> str:
+    """The first place at which two documents of objects, lists, arrays and values differ."""
     if isinstance(said, np.ndarray):
         same = said.shape == np.shape(taken) and np.array_equal(said, taken, equal_nan=True)
         return "" if same else f"{where} holds other numbers"
     if isinstance(said, dict) and isinstance(taken, dict):
-        keys = said if partly else {**said, **taken}
-        strange = [key for key in keys if (key in said) != (key in taken)]
-        if strange := [key for key in strange if not partly or key != "zz_nobody_knows"]:
+        if strange := sorted(said.keys() ^ taken.keys()):
             return f"{where}.{strange[0]} was taken, or was said, but not both"
-        pairs = {key: (said[key], taken[key]) for key in keys if key in taken}
+        pairs = {key: (said[key], taken[key]) for key in said}
     elif isinstance(said, list | tuple) and isinstance(taken, list | tuple):
         if len(said) != len(taken):
             return f"{where}: {len(taken)} of {len(said)} entries were taken"
         pairs = dict(enumerate(zip(said, taken, strict=True)))
     else:
-        if partly and isinstance(said, str) and "/" in said:
-            said = os.path.normpath(said)
-        numbers = (int, float)
-        alike = type(said) is type(taken) or (type(said) in numbers and type(taken) in numbers)
-        same = alike and (said == taken or said != said)
+        same = type(said) is type(taken) and (said == taken or said != said)
         return "" if same else f"{where}: {said!r:.80} was taken as {taken!r:.80}"
-    wrong = (differ(f"{where}.{key}", *pair, partly) for key, pair in pairs.items())
+    wrong = (differ(f"{where}.{key}", *pair) for key, pair in pairs.items())
     return next(filter(None, wrong), "")
 
 

@@ -151,8 +151,7 @@ def _in_child(case: Case, write: int) -> None:
         change = case.make()
         os.write(write, pickle.dumps(("made", change)))
         os.chdir(case.folder)
-        case.fault()
-        before = _limit(case.seconds * (2 if case.by_shell else 1))  # it has to import first
+        before = _limit(case.seconds)
         try:
             code = case.run()
         except SystemExit as stop:

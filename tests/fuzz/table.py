@@ -1,6 +1,6 @@
-"""Break files of every kind, run commands on them, and write the table of how that ended.
+"""Break files of every kind, run commands on them, and print the table of how that ended.
 
-python -m tests.fuzz.table --cases 10000 --seed 1 --write    into docs/data/errors.md
+python -m tests.fuzz.table --cases 10000 --seed 1
 python -m tests.fuzz.table --seed 1 --case 77 --corpus DIR   one case; keeps its folder beside DIR
 
 How it works:
@@ -11,12 +11,11 @@ How it works:
 3. mutations.py has what chance does to a file, by the kind of file; hostile.py, what somebody would
    write on purpose. Each change says what may come of it where the command ends with 0.
 4. runner.py forks a process for each case from one that has imported everything, and limits it to
-   10 s and 2 GiB. A case of some classes runs as a user runs it instead, by the shell.
+   10 s and 2 GiB.
 5. oracle.py judges. After exit 0, what was read must be as before where the change permits nothing
    else. After exit 2, one message must name the file and say what to do. Whatever else happens is
    a failure.
-6. planted.py breaks the pipeline in every way that the table has a column for: a suite that cannot
-   fail is worth nothing. And whatever lies in the corpus must first be right as it is.
+6. Whatever lies in the corpus must first be right as it is.
 """
 
 import os
@@ -33,11 +32,8 @@ from pathlib import Path
 
 from tests.fuzz.cases import CLASSES, Case, wholes
 from tests.fuzz.corpus import write_corpus
-from tests.fuzz.planted import unreported
 from tests.fuzz.runner import OUTCOMES, Verdict, in_child, run_cases, warm
 
-PAGE = Path(__file__).parents[2] / "docs/data/errors.md"
-BEGIN, END = "<!-- fuzz table: begin -->", "<!-- fuzz table: end -->"
 HEADS = ("read", "refused clearly", "failed")
 
 
@@ -52,15 +48,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--jobs", type=int, default=min(2, os.cpu_count() or 1))
     parser.add_argument("--corpus", type=Path, help="where it is, or is to be made and kept")
     parser.add_argument("--real", type=Path, help="where real recordings are")
-    parser.add_argument("--planted", action="store_true", help="first see that faults are reported")
-    parser.add_argument("--write", action="store_true", help="put the table into the page")
     options = parser.parse_args(arguments)
     with tempfile.TemporaryDirectory(prefix="fuzz-") as folder:
         corpus = (options.corpus or Path(folder) / "corpus").absolute()
         prepare(corpus, options.real, options.jobs)
-        if options.planted and (missed := unreported(corpus, options.jobs)):
-            print("planted, and not reported:", *missed, sep="\n  ", file=sys.stderr)
-            return 1
         numbers = range(options.cases) if options.case is None else [options.case]
         cases = [Case(options.seed, number, corpus) for number in numbers]
         verdicts = []
@@ -68,10 +59,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             verdicts.append(verdict)
             if options.case is not None or not verdict.good:
                 print(verdict, file=sys.stderr, flush=True)
-    table = rows(verdicts)
-    print("\n".join(table))
-    if options.write:
-        put(table, f"--cases {options.cases} --seed {options.seed} --write")
+    print("\n".join(rows(verdicts)))
     return not all(verdict.good for verdict in verdicts)
 
 
@@ -95,14 +83,6 @@ def rows(verdicts: Sequence[Verdict]) -> list[str]:
         numbers = [right, clear, sum(failed)]
         lines.append(f"| {kind} | {sum(numbers)} | {' | '.join(map(str, numbers))} |")
     return lines
-
-
-def put(table: Sequence[str], options: str) -> None:
-    """Write the table into the page, between its marks."""
-    before, _, rest = PAGE.read_text("utf-8").partition(BEGIN)
-    told = f"`python -m tests.fuzz.table {options}` made this table."
-    text = "\n".join([BEGIN, told, "", *table, END])
-    PAGE.write_text(f"{before}{text}{rest.partition(END)[2]}", "utf-8")
 
 
 if __name__ == "__main__":
