@@ -17,11 +17,9 @@ from typing import Any
 
 import torch
 
-from benchmarks.flops import peak_flops
 from benchmarks.stores import write_store
 from benchmarks.timing import Work, arguments, at_least, at_most, race, report
 from pipeline.base.config import TrainHeadParams, load_params
-from pipeline.policy.policy import flop_table
 from pipeline.store import Batch, FeatureStore
 from pipeline.train.batches import BatchIndices, Prefetch, Windows
 from pipeline.train.loop import Trainer
@@ -81,7 +79,6 @@ def main() -> None:
         settings={
             **sizes,
             "train_head": trainer.params.model_dump(mode="json", exclude={"output", "logs"}),
-            "flops": "three times those of a forward pass",
         },
         results=results,
         ratios=ratios,
@@ -122,11 +119,6 @@ def measure(
         at_most(f"{FEED}: share of the step spent waiting", share, 0.02),
         at_least(f"{FEED}: samples/s against batches in RAM", found.speed(FEED, RAM), 0.95),
     ]
-    per_sample = 3 * sum(flops for _, flops in flop_table(trainer.policy))
-    for entry in results.values():
-        entry["flops_per_s"] = per_sample * entry["samples_per_s"]
-        if device.type == "cuda" and (peak := peak_flops(torch.cuda.get_device_name(device))):
-            entry["share_of_peak"] = entry["flops_per_s"] / peak
     return results, found.ratios(RAM), targets
 
 

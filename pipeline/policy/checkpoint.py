@@ -19,6 +19,7 @@ from pydantic import Field, field_validator, model_validator
 
 from pipeline.base.border import Document, Text, shown
 from pipeline.base.config import TrainHeadParams
+from pipeline.base.config.section import Section
 from pipeline.base.differences import describe, differences
 from pipeline.base.errors import CheckpointIncomplete, CheckpointMismatch, PipelineError
 from pipeline.base.files import (
@@ -55,18 +56,6 @@ Sha256 = Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
 WEIGHTS, DOCUMENT, GOLDEN = "policy.safetensors", "policy.json", "golden.safetensors"
 _FRAMES = "frames/"
 CHECKPOINT = OutputKind("a checkpoint of a policy", lambda folder: (folder / DOCUMENT).is_file())
-TRAINING_ALONE = {
-    "compile",
-    "decay_fraction",
-    "eval_samples",
-    "feed",
-    "loggers",
-    "lr_schedule",
-    "scratch",
-    "sensor_lr",
-    "terminal_stop",
-    "wandb_project",
-}
 _Layout = dict[str, tuple[str, tuple[int, ...]]]
 """The dtype and the shape of each tensor."""
 SOURCE_KEYS = ("feature_spec", "streams", "action_hz", "vlm_reuse_count")
@@ -94,10 +83,27 @@ class PolicyParams(Document):
     @field_validator("train_head", mode="before")
     @classmethod
     def _without_run_params(cls, params: object) -> object:
-        """Leave out params of training alone, of which earlier versions had others."""
+        """Leave out what only a run needs, and keys of other versions.
+
+        `FORMAT` rises where a key that changes a policy's answers is dropped.
+        """
         if not isinstance(params, dict):
             return params
-        return {k: params[k] for k in params if k not in TRAINING_ALONE}
+        known = _known(TrainHeadParams, params)
+        known.pop("loggers", None)
+        return known
+
+
+def _known(section: type[Section], document: Mapping[str, Any]) -> dict[str, Any]:
+    """The entries of a document that a section has."""
+    known: dict[str, Any] = {}
+    for name, entry in section.model_fields.items():
+        if name in document:
+            value, kind = document[name], entry.annotation
+            if isinstance(value, dict) and isinstance(kind, type) and issubclass(kind, Section):
+                value = _known(kind, value)
+            known[name] = value
+    return known
 
 
 class PolicyDocument(SourceDocument):
@@ -279,16 +285,10 @@ def load_policy(folder: Path) -> PolicyCheckpoint:
 
     Raises `CheckpointIncomplete` naming the file that is missing, truncated or altered.
     """
-    import torch
-
     document, content = read_document(folder / DOCUMENT, PolicyDocument)
     path, described = folder / WEIGHTS, _described_weights(folder, document)
-    # The layer `direct` is used in training alone; older checkpoints lack it.
-    weights = dict(read_tensors(path, document.weights_sha256))
-    absent = {name for name in described.keys() - weights.keys() if ".direct." in name}
-    kept = {name: layout for name, layout in described.items() if name not in absent}
-    _check_tensors(path, weights, kept)
-    weights |= {name: torch.zeros(described[name][1]) for name in absent}
+    weights = read_tensors(path, document.weights_sha256)
+    _check_tensors(path, weights, described)
     return PolicyCheckpoint(
         params=document.params.train_head,
         shape=document.shape,

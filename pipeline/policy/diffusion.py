@@ -25,7 +25,6 @@ from pipeline.policy.expert import (
     uniform,
 )
 
-ScheduleKind = Literal["cosine", "linear"]
 Prediction = Literal["epsilon", "sample", "v"]
 
 
@@ -48,7 +47,6 @@ class DiffusionActionExpert(DrawingExpert):
         dropout: float = 0.1,
         draws: int = 1,
         timesteps: int = 100,
-        schedule: ScheduleKind = "cosine",
         prediction: Prediction = "epsilon",
         sampler: Literal["ddpm", "ddim"] = "ddim",
         sampling_steps: int = 10,
@@ -62,7 +60,7 @@ class DiffusionActionExpert(DrawingExpert):
         )
         self.prediction: Prediction = prediction
         self.sampler, self.eta, self.clip = sampler, eta, clip
-        self.schedule = NoiseSchedule(timesteps, schedule)
+        self.schedule = NoiseSchedule(timesteps)
         self.steps = self.schedule.steps(timesteps if sampler == "ddpm" else sampling_steps)
 
     def drawn_loss(
@@ -139,10 +137,10 @@ class NoiseSchedule(nn.Module):
     signal: Tensor
     noise: Tensor
 
-    def __init__(self, timesteps: int = 100, kind: ScheduleKind = "cosine") -> None:
+    def __init__(self, timesteps: int = 100) -> None:
         super().__init__()
         self.timesteps = timesteps
-        betas = _cosine_betas(timesteps) if kind == "cosine" else _linear_betas(timesteps)
+        betas = _cosine_betas(timesteps)
         clean = torch.ones(1, dtype=torch.float64, device="cpu")
         alpha_bar = torch.cat([clean, (1 - betas).cumprod(0)])
         # Rounded at the end: of 1 - alpha_bar, float32 has few digits left at small steps.
@@ -227,14 +225,3 @@ def _cosine_betas(timesteps: int) -> Tensor:
     share = torch.linspace(0, 1, timesteps + 1, dtype=torch.float64, device="cpu")
     alpha_bar = torch.cos((share + 0.008) / 1.008 * math.pi / 2) ** 2
     return (1 - alpha_bar[1:] / alpha_bar[:-1]).clamp(max=0.999)
-
-
-def _linear_betas(timesteps: int) -> Tensor:
-    """Ho et al. 2020, section 4: 1e-4 to 0.02 over 1000 steps.
-
-    With another number of steps they grow by 1000 / timesteps, so that as little is left at the
-    end, and are held at 0.999.
-    """
-    scale = 1000 / timesteps
-    betas = torch.linspace(1e-4, 0.02, timesteps, dtype=torch.float64, device="cpu")
-    return (scale * betas).clamp(max=0.999)

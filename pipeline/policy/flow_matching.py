@@ -19,13 +19,12 @@ from pipeline.policy.expert import (
     uniform,
 )
 
-Solver = Literal["euler", "midpoint", "rk4"]
+Solver = Literal["euler", "rk4"]
 Velocity = Callable[[Tensor, float], Tensor]
 
 _STAGES: dict[Solver, tuple[tuple[float, ...], tuple[float, ...]]] = {
     # The place of each stage within the step, and its weight; each stage builds on the one before.
     "euler": ((0.0,), (1.0,)),
-    "midpoint": ((0.0, 0.5), (0.0, 1.0)),
     "rk4": ((0.0, 0.5, 0.5, 1.0), (1 / 6, 1 / 3, 1 / 3, 1 / 6)),
 }
 
@@ -33,7 +32,7 @@ _STAGES: dict[Solver, tuple[tuple[float, ...], tuple[float, ...]]] = {
 def integrate(velocity: Velocity, start: Tensor, steps: int, solver: Solver) -> Tensor:
     """Where dx/dt = velocity(x, t) takes `start` from t = 0 to 1 in equal steps.
 
-    Explicit Runge-Kutta methods of order 1, 2 and 4 (Butcher 2016, section 23).
+    Explicit Runge-Kutta methods of order 1 and 4 (Butcher 2016, section 23).
     """
     nodes, weights = _STAGES[solver]
     x, width = start, 1 / steps
@@ -47,20 +46,21 @@ def integrate(velocity: Velocity, start: Tensor, steps: int, solver: Solver) -> 
 
 
 class BetaTimes(nn.Module):
-    """Times t in [0, 1] whose noise share 1 - t is beta-distributed.
+    """Times t in [0, 1] whose noise share 1 - t has the distribution Beta(1.5, 1).
 
-    Uniform numbers go through a table of the distribution's quantiles, exact to 1/4096 in
-    probability: `torch.distributions.Beta` takes no generator.
+    So noisy times are drawn more often (pi0, Black et al. 2024). Uniform numbers go through a table
+    of the distribution's quantiles, exact to 1/4096 in probability: `torch.distributions.Beta`
+    takes no generator.
     """
 
     quantiles: Tensor
 
-    def __init__(self, alpha: float, beta: float) -> None:
+    def __init__(self) -> None:
         from scipy.special import betaincinv  # slow to import; only used here
 
         super().__init__()
         grid = torch.linspace(0, 1, 4097, dtype=torch.float64, device="cpu")
-        table = torch.from_numpy(betaincinv(alpha, beta, grid.numpy()))
+        table = torch.from_numpy(betaincinv(1.5, 1.0, grid.numpy()))
         self.register_buffer("quantiles", table.float(), persistent=False)
 
     def forward(self, drawn: Float[Tensor, " batch"]) -> Float[Tensor, " batch"]:
@@ -75,8 +75,7 @@ class FlowMatchingActionExpert(DrawingExpert):
 
     Noise at t = 0 and the chunk at t = 1 are joined by x_t = (1 - t) noise + t chunk (Lipman et
     al. 2023, eq. 22 with no noise left at the end); the network learns the velocity chunk - noise,
-    and `act` follows it in `sampling_steps` steps of `solver`. `time` says how t is drawn in the
-    loss: uniformly, or with a noise share 1 - t of Beta(`alpha`, `beta`) (pi0, Black et al. 2024).
+    and `act` follows it in `sampling_steps` steps of `solver`.
     """
 
     def __init__(
@@ -91,9 +90,6 @@ class FlowMatchingActionExpert(DrawingExpert):
         draws: int = 1,
         sampling_steps: int = 10,
         solver: Solver = "euler",
-        time: Literal["uniform", "beta"] = "uniform",
-        alpha: float = 1.5,
-        beta: float = 1.0,
         groups: Sequence[str] | None = None,
         group_weights: Mapping[str, float] | None = None,
     ) -> None:
@@ -102,7 +98,7 @@ class FlowMatchingActionExpert(DrawingExpert):
         )
         self.sampling_steps = sampling_steps
         self.solver: Solver = solver
-        self.times = BetaTimes(alpha, beta) if time == "beta" else nn.Identity()
+        self.times = BetaTimes()
 
     def drawn_loss(
         self, context: Context, chunk: Chunk, valid: StepMask, generator: Generator | None

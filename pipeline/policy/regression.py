@@ -2,8 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 
-import torch
-from torch import Generator, Tensor, nn
+from torch import Generator, nn
 
 from pipeline.policy.attention import TransformerLayer, learned
 from pipeline.policy.expert import ActionExpert, Chunk, Context, Generators, Guide, Losses, StepMask
@@ -12,9 +11,8 @@ from pipeline.policy.expert import ActionExpert, Chunk, Context, Generators, Gui
 class RegressionActionExpert(ActionExpert):
     """A transformer decoder from learned queries, one a step of the horizon.
 
-    The chunk is refined `refinements` times: each round reads the proposal of the round before
-    (the first reads zeros) and adds to it. `predict` takes the context and nothing else, and both
-    `loss` and `act` use it, so a target cannot become an input.
+    `predict` takes the context and nothing else, and both `loss` and `act` use it, so a target
+    cannot become an input.
     """
 
     stochastic = False
@@ -28,15 +26,11 @@ class RegressionActionExpert(ActionExpert):
         layers: int = 4,
         heads: int = 8,
         dropout: float = 0.1,
-        refinements: int = 1,
         groups: Sequence[str] | None = None,
         group_weights: Mapping[str, float] | None = None,
     ) -> None:
         super().__init__(horizon, action_dim, groups, group_weights, "smooth_l1")
-        self.refinements = refinements
         self.queries = learned(horizon, dim)
-        # The first proposal is zeros: with a single round there is nothing to read.
-        self.read = nn.Linear(action_dim, dim) if refinements > 1 else None
         self.layers = nn.ModuleList(
             TransformerLayer(dim, heads, dropout=dropout, cross=True) for _ in range(layers)
         )
@@ -47,19 +41,10 @@ class RegressionActionExpert(ActionExpert):
 
     def predict(self, context: Context) -> Chunk:
         """The chunk in normalised units, float32."""
-        shape = (context.shape[0], self.horizon, self.action_dim)
-        chunk = context.new_zeros(shape, dtype=torch.float32)
-        for _ in range(self.refinements):
-            chunk = chunk + self._delta(context, chunk).float()
-        return chunk
-
-    def _delta(self, context: Tensor, proposal: Tensor) -> Tensor:
         tokens = self.queries.expand(context.shape[0], -1, -1)
-        if self.read is not None:
-            tokens = tokens + self.read(proposal)
         for layer in self.layers:
             tokens = layer(tokens, context=context)
-        return self.head(self.norm(tokens))
+        return self.head(self.norm(tokens)).float()
 
     def loss(
         self, context: Context, actions: Chunk, valid: StepMask, generator: Generator | None = None

@@ -24,7 +24,7 @@ from pipeline.base.files import read_document, read_tensors, sync, write_tensors
 from pipeline.base.machine import resolve_device, use_bfloat16
 from pipeline.base.text import duration, size
 from pipeline.policy.checkpoint import PolicyCheckpoint, Sha256, load_policy, save_policy
-from pipeline.policy.policy import Policy, Trainable, describe_cost
+from pipeline.policy.policy import Policy, Trainable, describe_size
 from pipeline.store import Batch, FeatureStore, check_trailers
 from pipeline.train.batches import BatchIndices, FeatureSource, Windows, evenly
 from pipeline.train.log import History, Row, TrainingLog, check_loggers, open_log
@@ -176,7 +176,7 @@ class Trainer:
 
     def summary(self) -> list[str]:
         """Lines for the user: what is trained, from what data and on which device."""
-        lines = describe_cost(self.policy)
+        lines = [describe_size(self.policy)]
         if self.module is not self.policy:
             table = ", ".join(f"{part} {n:,}" for part, n in self.module.parameter_table())
             lines.append(f"parameters with what is before it: {table}")

@@ -1,7 +1,6 @@
 """A checkpoint comes back whole, or says what is wrong with it."""
 
 import json
-import os
 from collections.abc import Callable
 from dataclasses import replace
 from functools import reduce
@@ -54,10 +53,6 @@ PARAMS = TrainHeadParams.model_validate(
 @pytest.fixture(scope="module")
 def store(tiny_store, tmp_path_factory):
     return FeatureStore.open(tiny_store(tmp_path_factory.mktemp("checkpoint")))
-
-
-def seeded() -> torch.Generator:
-    return torch.Generator().manual_seed(5)
 
 
 def part(first: int, stop: int, content: str, group: str) -> EpisodePart:
@@ -119,21 +114,15 @@ def test_its_description_is_what_serving_needs(checkpoint, tmp_path):
         load_policy(tmp_path / "best")
 
 
-def test_a_checkpoint_from_before_the_direct_layer_loads(checkpoint, store, tmp_path):
-    """Experts that draw have a linear layer, `direct`, in training alone; once they had none."""
-    params = PARAMS.model_copy(update={"model_type": "flow_matching"})
-    weights = Policy(params, checkpoint.shape, checkpoint.normalization).state_dict()
-    older = {name: value for name, value in weights.items() if ".direct." not in name}
-    assert len(older) == len(weights) - 2
-    save_policy(tmp_path / "best", replace(checkpoint, params=params, weights=older))
-    loaded = load_policy(tmp_path / "best")
-    assert loaded.weights.keys() == weights.keys()
-    batch = store.gather([0, 31], horizon=3, sensor_window=6, state_window=5)
-    acted = [
-        replace(checkpoint, params=params, weights=kept).policy().act(batch, seeded())
-        for kept in (weights, loaded.weights)
-    ]
-    assert torch.equal(*acted)
+def test_keys_of_other_versions_are_left_out(checkpoint, tmp_path):
+    save_policy(tmp_path / "best", checkpoint)
+    path = tmp_path / "best/policy.json"
+    document = read_document(path, dict)[1]
+    head = document["params"]["train_head"]
+    head |= {"sensor_lr": 1e-3, "loggers": ["report"], "regression": {"refinements": 1}}
+    head["diffusion"]["schedule"] = "cosine"
+    write_with_digest(path, document)
+    assert load_policy(tmp_path / "best").params == PARAMS
 
 
 def test_a_folder_or_a_run_is_found(checkpoint, tmp_path):
@@ -153,9 +142,6 @@ OVERLAPPING = part(10, 24, "0-5", "g").model_dump(mode="json")
     [
         ("format", 2, "format: expected 3, found 2"),
         ("shape.action_groups", ["other"], "shape.action_groups: expected 5, found 1"),
-        ("shape.state_kinds", ["deg"] * 3, "shape.state_kinds: expected 0 or 4, found 3"),
-        ("shape.slots", 4, "shape.slots: expected 3, found 4"),
-        ("shape.feature_dim", 9, "shape.feature_dim: expected 8, found 9"),
         ("streams.views", ["View2"], "feature_spec.views: expected ('View2',), found ('View1',)"),
         ("split", {"train": {}}, "split: expected train, val, test, found train"),
         ("split.train.right/episode_005.ticks", [9, 3], "expected the first before the last"),
@@ -179,21 +165,6 @@ def test_a_description_that_is_none_is_named(checkpoint, tmp_path, place, value,
     assert "Copy it again, name another, or remove its folder and run the training" in message
 
 
-@pytest.mark.parametrize(
-    "content",
-    [b'{"format": 3, "step": NaN}', b'{"format":' + b"[" * 100_000, None],
-    ids=["nan", "deep", "pipe"],
-)
-def test_what_is_no_document_is_refused_before_it_is_read(checkpoint, tmp_path, content):
-    save_policy(tmp_path / "best", checkpoint)
-    path = tmp_path / "best/policy.json"
-    path.unlink()
-    os.mkfifo(path) if content is None else path.write_bytes(content)
-    for read in (load_policy, check_policy):
-        with pytest.raises(CheckpointIncomplete, match=r"policy\.json: .*Copy it again"):
-            read(tmp_path / "best")
-
-
 def _first(weights: dict[str, Any], change: Callable[[Any], Any]) -> dict[str, Any]:
     name = next(name for name, value in weights.items() if value.ndim == 2)
     return {**weights, name: change(weights[name])}
@@ -214,13 +185,6 @@ def test_weights_of_another_policy_are_refused(checkpoint, tmp_path, change, sai
     with pytest.raises((CheckpointIncomplete, CheckpointMismatch), match=said) as caught:
         load_policy(tmp_path / "best")
     assert str(tmp_path / "best/policy.safetensors") in str(caught.value)
-
-
-def test_missing_weights_are_named(checkpoint, tmp_path):
-    save_policy(tmp_path / "best", checkpoint)
-    (tmp_path / "best/policy.safetensors").unlink()
-    with pytest.raises(CheckpointIncomplete, match=r"policy\.safetensors.*no such file"):
-        load_policy(tmp_path / "best")
 
 
 class TestGoldenRows:

@@ -3,11 +3,8 @@
 from itertools import pairwise
 from typing import Any
 
-import numpy as np
 import pytest
 import torch
-from scipy.optimize import brentq
-from scipy.stats import norm
 from torch import Tensor, nn
 
 from pipeline.base.config import DiffusionParams
@@ -56,7 +53,7 @@ class TestTwoModes:
         [
             {"sampler": "ddpm", "prediction": "epsilon"},
             {"sampling_steps": 100, "eta": 0.0, "prediction": "v"},
-            {"sampling_steps": 100, "eta": 0.5, "prediction": "epsilon", "schedule": "linear"},
+            {"sampling_steps": 100, "eta": 0.5, "prediction": "epsilon"},
         ],
         ids=str,
     )
@@ -67,13 +64,6 @@ class TestTwoModes:
         torch.testing.assert_close(means, two_modes.means, rtol=0, atol=0.02)
         assert ((spreads - two_modes.spread).abs() < 0.15 * two_modes.spread).all()
         assert near > 0.99
-
-    def test_the_defaults_draw_them_roughly_in_ten_steps(self, two_modes, optimal):
-        weights, means, spreads, near = two_modes.judge(drawn(optimal(two_modes)))
-        torch.testing.assert_close(weights, two_modes.weights, rtol=0, atol=0.025)
-        torch.testing.assert_close(means, two_modes.means, rtol=0, atol=0.06)
-        assert ((spreads - two_modes.spread).abs() < 0.4 * two_modes.spread).all()
-        assert near > 0.97
 
 
 @pytest.mark.parametrize(("eta", "count"), [(0.0, 10), (0.6, 10)])
@@ -107,39 +97,6 @@ def test_few_steps_do_not_pull_the_mean_towards_the_noise(count, mixture, optima
 
 
 class TestFlow:
-    """DDIM with eta 0 follows the probability-flow ODE (Song et al. 2021, section 4.3).
-
-    On a line that flow keeps the order of points, so it takes a quantile of the noisy mixture to
-    the same quantile of the mixture.
-    """
-
-    @staticmethod
-    def quantile(mixture: Any, signal: float, noise: float, at: float) -> float:
-        width = np.sqrt((signal * mixture.spread) ** 2 + noise**2)
-        means, weights = signal * mixture.means[:, 0].double().numpy(), mixture.weights.numpy()
-        return brentq(lambda x: weights @ norm.cdf((x - means) / width) - at, -10, 10)
-
-    def test_ddim_takes_quantiles_to_quantiles_as_steps_grow(self, mixture, optimal):
-        line = mixture(torch.tensor([[-0.8], [0.6]]), torch.tensor([0.3, 0.7]), 0.3)
-        levels = torch.linspace(0.02, 0.98, 25)
-        expected = torch.tensor([self.quantile(line, 1.0, 0.0, float(x)) for x in levels])
-        errors = []
-        for count in (25, 100, 400):
-            expert = optimal(line, timesteps=1000, sampling_steps=count)
-            step = expert.steps[0]
-            signal, noise = (
-                float(x[step]) for x in (expert.schedule.signal, expert.schedule.noise)
-            )
-            chunk = torch.tensor([self.quantile(line, signal, noise, float(x)) for x in levels])
-            chunk = chunk.float().view(-1, 1, 1)
-            for now, to in pairwise(expert.steps):
-                sample = expert.clean(chunk, now, torch.zeros(25, 1, 8))
-                chunk, _ = expert.schedule.ddim(sample, chunk, now, to, 0.0)
-            errors.append(float((chunk.squeeze() - expected).abs().max()))
-        assert errors[1] < errors[0] / 2.5
-        assert errors[2] < errors[1] / 2.5
-        assert errors[2] < 0.01
-
     def test_eta_zero_draws_its_first_noise_and_no_more(self, two_modes, optimal):
         generator, apart = torch.Generator().manual_seed(0), torch.Generator().manual_seed(0)
         optimal(two_modes).act(torch.zeros(7, 1, 8), generator)
@@ -191,13 +148,11 @@ class Wild(nn.Module):
         return torch.full_like(noisy, 1e6)
 
 
-@pytest.mark.parametrize(
-    ("prediction", "schedule"), [("epsilon", "cosine"), ("sample", "linear"), ("v", "cosine")]
-)
-def test_the_best_network_has_the_smallest_loss_there_is(prediction, schedule, mixture, optimal):
+@pytest.mark.parametrize("prediction", ["epsilon", "sample", "v"])
+def test_the_best_network_has_the_smallest_loss_there_is(prediction, mixture, optimal):
     """The variance of the target given the noisy chunk, over the steps that are drawn."""
     gaussian = mixture(torch.tensor([[0.5, -1.0]]), torch.ones(1), 0.6)
-    expert = optimal(gaussian, prediction=prediction, schedule=schedule)
+    expert = optimal(gaussian, prediction=prediction)
     generator, count = torch.Generator().manual_seed(0), 100_000
     chunk, valid = gaussian.draw(count, generator), torch.ones(count, 1, dtype=torch.bool)
     loss, _ = expert.drawn_loss(torch.zeros(count, 1, 8), chunk, valid, generator)
@@ -215,4 +170,3 @@ def test_the_section_of_params_is_the_constructor():
     assert expert.schedule.timesteps == 100
     assert (expert.prediction, expert.draws) == (params.prediction, params.draws)
     assert expert.steps == expert.schedule.steps(params.sampling_steps)
-    torch.testing.assert_close(expert.schedule.alpha_bar, NoiseSchedule(100, "cosine").alpha_bar)

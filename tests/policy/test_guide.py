@@ -132,14 +132,6 @@ def test_what_the_clip_holds_is_still_pulled():
     assert (guided - guide.chunk).square().mean() < 1e-2
 
 
-def test_flow_and_diffusion_pull_alike():
-    """ddim's steps follow the flow of Euler's, so the same guide leads to the same chunks."""
-    guide = prefix_guide(TestPrefix.PREFIX, 50)
-    flow = drawn(optimal(FlowMatchingActionExpert, sampling_steps=200), guide, 50)
-    ddim = optimal(DiffusionActionExpert, timesteps=1000, sampling_steps=200, prediction="v")
-    torch.testing.assert_close(drawn(ddim, guide, 50), flow, rtol=0, atol=0.1)
-
-
 class TestGain:
     def test_it_is_that_of_the_paper(self):
         for tau in (0.25, 0.5, 0.7):

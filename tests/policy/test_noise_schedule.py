@@ -8,13 +8,11 @@ import torch
 
 from pipeline.policy.diffusion import NoiseSchedule
 
-KINDS = ("cosine", "linear")
 
-
-@pytest.fixture(params=KINDS)
-def schedule(request):
+@pytest.fixture
+def schedule():
     """In double precision, so that only the formulas differ; still the float32 schedule."""
-    return NoiseSchedule(100, request.param).double()
+    return NoiseSchedule(100).double()
 
 
 @pytest.fixture
@@ -42,12 +40,6 @@ class TestValues:
         alpha_bar = NoiseSchedule(100).alpha_bar.double()
         assert float(1 - alpha_bar[100] / alpha_bar[99]) == pytest.approx(0.999, rel=1e-6)
 
-    def test_linear_is_the_papers_at_1000_steps(self):
-        alpha_bar = NoiseSchedule(1000, "linear").alpha_bar.double()
-        betas = 1 - alpha_bar[1:] / alpha_bar[:-1]
-        expected = torch.linspace(1e-4, 0.02, 1000, dtype=torch.float64)
-        torch.testing.assert_close(betas, expected, rtol=0, atol=1e-6)
-
 
 class TestBuffers:
     """The seeds' schedule stayed on one device, outside the state dict."""
@@ -58,11 +50,10 @@ class TestBuffers:
         assert not list(schedule.parameters())
 
     def test_they_come_back_with_the_weights(self):
-        linear, cosine = NoiseSchedule(kind="linear"), NoiseSchedule()
-        assert not torch.equal(linear.signal, cosine.signal)
-        cosine.load_state_dict(linear.state_dict())
-        for name, buffer in linear.named_buffers():
-            assert torch.equal(cosine.get_buffer(name), buffer), name
+        trained, fresh = NoiseSchedule(), NoiseSchedule()
+        trained.signal *= 0.5
+        fresh.load_state_dict(trained.state_dict())
+        assert torch.equal(fresh.signal, trained.signal)
 
 
 def test_the_noise_of_all_single_steps_is_that_of_one_jump(schedule):
@@ -111,14 +102,6 @@ class TestDDIM:
             expected_mean, expected_variance = schedule.posterior(sample, noisy, step)
             torch.testing.assert_close(mean, expected_mean, rtol=0, atol=2e-3)
             torch.testing.assert_close(variance, expected_variance, rtol=1e-5, atol=0)
-
-    @pytest.mark.parametrize("eta", [0.5, 1.0])
-    def test_each_jump_keeps_the_share_of_noise(self, eta, schedule):
-        """A chunk of pure noise 1 at `step` has mean^2 + variance = noise^2 at `to` (eq. 7)."""
-        for step, to in ((100, 99), (100, 50), (57, 3), (2, 1), (40, 0)):
-            noisy = schedule.noise[step].expand(1, 1, 1)
-            mean, variance = schedule.ddim(torch.zeros_like(noisy), noisy, step, to, eta)
-            torch.testing.assert_close(mean.squeeze() ** 2 + variance, schedule.noise[to] ** 2)
 
 
 class TestSteps:

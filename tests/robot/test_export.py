@@ -72,7 +72,6 @@ FEATURES_ALONE: dict[str, Any] = {
 RARE: list[dict[str, Any]] = [
     {
         "fusion_strategy": "none",
-        "regression": {"refinements": 2},
         "sensor_encoder": SMALL["sensor_encoder"] | {"kind": "force_aware"},
         "sensor_window_s": None,
         "state_window_s": None,

@@ -9,7 +9,7 @@ import pytest
 import zarr
 
 from pipeline.base.config import TrainHeadParams
-from pipeline.store import Batch, FeatureStore
+from pipeline.store import FeatureStore
 from pipeline.store.chunks import write_seal
 from pipeline.train.batches import BatchIndices
 from pipeline.train.loop import Trainer
@@ -133,20 +133,3 @@ def draw_plan():
         ]
 
     return make
-
-
-@pytest.fixture(scope="session")
-def same_bits():
-    """Whether two batches are equal to the bit, in shape and in dtype."""
-
-    def compare(one: Batch, other: Batch) -> bool:
-        return all(
-            value.dtype == getattr(other, name).dtype
-            and value.shape == getattr(other, name).shape
-            and value.cpu().numpy(force=True).tobytes() == getattr(other, name).numpy().tobytes()
-            if value.dtype.is_floating_point and value.element_size() > 2
-            else value.cpu().equal(getattr(other, name))
-            for name, value in vars(one).items()
-        )
-
-    return compare

@@ -16,7 +16,6 @@ from pipeline.base.errors import ConfigError, DiskFull
 from pipeline.base.files import MARKER, read_document, write_document
 from pipeline.train import log as loggers
 from pipeline.train.log import TrainingLog, check_loggers
-from pipeline.train.run import run_identity
 
 ROOT = Path(__file__).resolve().parents[2]
 LOGS = {MARKER, "plots", "metrics.json"}
@@ -100,13 +99,6 @@ def test_every_logger_has_the_curves_of_dvc_after_a_stop_too(
         assert [step for step, _ in found[name]] == [step for step, _ in points], name
         assert [v for _, v in found[name]] == pytest.approx([v for _, v in points], rel=1e-6)
     assert {path.name for path in chosen.logs.iterdir()} == LOGS
-
-
-def test_who_shows_the_curves_decides_no_number(store, params):
-    identity = run_identity(params(loggers=[]), store)
-    assert run_identity(params(loggers=["tensorboard"]), store) == identity
-    decides = identity["decides"]["train_head"]
-    assert "loggers" not in decides
 
 
 EARLIER = {"loggers": ["report"], "scratch": None, "feed": "compressed", "sensor_lr": 1e-3}

@@ -10,7 +10,6 @@ from pipeline.base.config import TrainHeadParams
 from pipeline.train.log import History
 from pipeline.train.optimizer import (
     WeightAverage,
-    decay_groups,
     make_optimizer,
     optimizer_tensors,
     restore_optimizer,
@@ -69,19 +68,6 @@ def test_every_group_has_its_own_peak_and_decay():
         "norm.weight": (1e-3, 0.0),
         "norm.bias": (1e-3, 0.0),
         "query": (1e-3, 0.0),
-    }
-
-
-def test_only_matrices_and_kernels_decay():
-    decayed, kept = decay_groups(Toy())
-    assert decayed == ["linear.weight", "conv.weight"]
-    assert set(kept) == {
-        "query",
-        "linear.bias",
-        "conv.bias",
-        "norm.weight",
-        "norm.bias",
-        "embedding.weight",
     }
 
 

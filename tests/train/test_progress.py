@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from pipeline.store import FeatureStore, episode_name
+from pipeline.store import episode_name
 from pipeline.train.batches import Prefetch, Windows
 from pipeline.train.progress import Progress, describe_data, peak_memory_bytes
 from pipeline.train.run import policy_shape
@@ -133,10 +133,3 @@ def test_a_stream_that_no_training_episode_has_is_named(store, warnings):
     assert line.startswith("warning: sensor")
     assert "the training episodes' windows" in line and "train_head.split" in line
     assert warnings(train, absent, sensor_enabled=False) == []
-
-
-def test_a_training_says_it_last_before_it_begins(tiny_store, trainer, params, tmp_path):
-    """Of two recordings one is held out, and with it its source."""
-    two = FeatureStore.open(tiny_store(tmp_path, episodes=2))
-    *_, last = trainer(two, params()).summary()
-    assert last.startswith("warning: source ")

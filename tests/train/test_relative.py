@@ -78,11 +78,6 @@ def test_a_joint_that_stands_elsewhere_in_val_does_not_choose_the_checkpoint(
     assert done.stopping.best_error < 10
 
 
-def test_deltas_have_no_such_form(store, params, trainer):
-    with pytest.raises(ConfigError, match=r"action_form: relative needs absolute actions"):
-        trainer(store, params(action_form="relative"))
-
-
 def test_a_tick_without_a_state_is_named(absolute, params, trainer, reseal, tmp_path):
     path = tmp_path / "holes.zarr"
     shutil.copytree(absolute.path, path)

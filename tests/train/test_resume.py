@@ -17,17 +17,9 @@ def weights(trainer: Trainer) -> list[torch.Tensor]:
     return [value.clone() for state in both for value in state.values()]
 
 
-@pytest.mark.parametrize(
-    "model_type",
-    [
-        "diffusion",
-        pytest.param("regression", marks=pytest.mark.slow),
-        pytest.param("flow_matching", marks=pytest.mark.slow),
-    ],
-)
-def test_every_step_can_be_gone_on_from(store, params, trainer, tmp_path, monkeypatch, model_type):
+def test_every_step_can_be_gone_on_from(store, params, trainer, tmp_path, monkeypatch):
     chosen = {
-        "model_type": model_type,
+        "model_type": "diffusion",
         "grad_accumulation": 2,
         "max_steps": STEPS,
         "warmup_steps": 2,
@@ -35,7 +27,6 @@ def test_every_step_can_be_gone_on_from(store, params, trainer, tmp_path, monkey
         "checkpoint_every": 1,
         "drop_sensor": 0.3,
         "diffusion": {"sampling_steps": 2},
-        "flow_matching": {"sampling_steps": 2},
     }
     kept = tmp_path / "kept"
     real = Trainer._save_last

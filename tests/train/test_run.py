@@ -54,7 +54,7 @@ def test_a_finished_run_is_left_alone(store, params, finished):
     leftover = finished / "last" / "trainer.json"
     leftover.touch()  # killed between renaming and tidying
     assert len(open_run(params(), store).notes) == 1
-    run = open_run(params(device="cpu", logs="elsewhere", checkpoint_every=1), store)
+    run = open_run(params(logs="elsewhere", checkpoint_every=1, loggers=["wandb"]), store)
     assert run.status == "finished"
     assert open_run(params(), store, {"adapter": "another"}).status == "new"
     assert open_run(params(grad_accumulation=2), store).status == "new"
@@ -149,14 +149,6 @@ def test_other_recordings_of_the_same_kind_begin_anew(
 def test_a_checkpoint_swap_that_was_killed_is_recovered(store, params, trainer, unfinished):
     (unfinished / "last.new").mkdir()
     assert trainer(store, params()).step == 4
-
-
-@pytest.mark.parametrize("file", ["trainer.safetensors", "policy.safetensors"])
-def test_a_truncated_checkpoint_is_named(store, params, trainer, unfinished, file):
-    path = unfinished / "last" / file
-    path.write_bytes(path.read_bytes()[:-20])
-    with pytest.raises(CheckpointIncomplete, match=rf"{file}: .*Copy it again"):
-        trainer(store, params())
 
 
 @pytest.mark.parametrize(

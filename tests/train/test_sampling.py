@@ -82,10 +82,6 @@ class TestTickSampler:
         assert sampler.batch(0).min() >= 5
         assert sampler.shares == {"s1": 1.0}
 
-    def test_a_batch_may_span_several_epochs(self):
-        batch = TickSampler(sources([3]), {}, 10, 0).batch(2)
-        assert np.bincount(batch).tolist() in ([4, 3, 3], [3, 4, 3], [3, 3, 4])
-
     @pytest.mark.parametrize(
         ("weights", "complaint"),
         [({"elsewhere": 1.0}, "names elsewhere"), ({"s0": 0.0}, "nothing to train on")],

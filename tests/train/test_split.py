@@ -203,15 +203,6 @@ class TestSides:
             count = sum(name.startswith(source) for name in sides)
             assert own == asked if count > 2 else count < 2 or "train" in own
 
-    @given(st.lists(st.sets(st.sampled_from("abcd"), min_size=1), min_size=3, max_size=12))
-    @settings(deadline=None)
-    def test_formats_of_one_recording_in_several_sources_share_a_side(self, recordings):
-        held = [(key, source) for key, own in enumerate(recordings) for source in sorted(own)]
-        store = FakeStore([6] * len(held), [key for key, _ in held])
-        for episode, (_, source) in zip(store.episodes, held, strict=True):
-            episode.source = source
-        assert set(sides_of(store, drawn(store)).values()) == {"train", "val", "test"}
-
     def test_the_hash_of_seed_and_name_decides(self):
         store = FakeStore([3] * 1000)
         for seed in (0, 7):
@@ -227,18 +218,6 @@ class TestSides:
         before = sides_of(store := FakeStore([6] * 40), drawn(store))
         after = sides_of(store := FakeStore([6] * 41), drawn(store))
         assert before.items() <= after.items()
-
-    def test_another_format_of_an_episode_moves_no_other(self):
-        before = sides_of(store := FakeStore([6] * 40), drawn(store))
-        for twin in range(40):
-            store = FakeStore([6] * 41, [*range(40), twin])
-            # Its name comes first, so that the pair's side is by its hash.
-            store.episodes[40].id = "another_format"
-            after = sides_of(store, drawn(store))
-            pair = f"s/episode_{twin}", "s/another_format"
-            assert after[pair[0]] == after[pair[1]]
-            kept = {name: side for name, side in after.items() if name not in pair}
-            assert kept.items() <= before.items()
 
     def test_what_was_moved_is_noted(self):
         split = drawn(FakeStore([6] * 4, sources="ab"), val=0.01, test=0.01)
@@ -339,17 +318,6 @@ class TestCutByTime:
         assert "20% of its ticks, cut from its end, are test" in str(split.note)
         assert "less than a recording never seen" in str(split.note)
 
-    @pytest.mark.parametrize("side", ["val", "test"])
-    def test_a_side_that_is_not_asked_for_costs_nothing(self, side):
-        split = drawn(FakeStore([100]), 8, **({"val": 0.0, "test": 0.0} | {side: 0.2}))
-        assert getattr(split, side).tolist() == list(range(80, 100))
-        assert len(split.train) == 73
-
-    def test_a_single_recording_in_two_formats_holds_out_both_tails(self):
-        split = drawn(FakeStore([50, 50], keys=[7, 7]), 1, val=0.1, test=0.2)
-        assert split.test.tolist() == [*range(40, 50), *range(90, 100)]
-        assert split.val.tolist() == [*range(35, 40), *range(85, 90)]
-
     def test_formats_of_one_recording_are_cut_at_one_instant(self):
         """The second begins 1 s later and ends 3 s earlier: its tail would begin at 5.8 s."""
         store = FakeStore([100, 60], keys=[7, 7], late=[0.0, 1.0])
@@ -364,12 +332,6 @@ class TestCutByTime:
         assert split.test.tolist() == [*range(80, 100), *range(180, 200)]
         # Of the second, the action of tick 79 lasts from 7.95 s to 8.05 s.
         assert split.train.tolist() == [*range(80), *range(100, 179)]
-
-    def test_a_format_that_ends_before_the_cut_is_trained_on_whole(self):
-        store = FakeStore([100, 2], keys=[7, 7], late=[0.0, 0.0])
-        split = drawn(store, 8, val=0, test=0.2)
-        assert split.train.tolist() == [*range(73), 100, 101]
-        assert store.names(split.test) == {"s/episode_0"}
 
     @given(
         st.lists(st.tuples(st.integers(1, 90), st.floats(0, 3)), min_size=1, max_size=4),

@@ -102,11 +102,6 @@ def test_a_number_that_is_none_is_named_by_episode_and_time(tiny_store, tmp_path
     assert "found nan" in str(caught.value)
 
 
-def test_no_ticks_are_no_statistics(tiny_store, tmp_path):
-    with pytest.raises(NumericsError, match="no rows"):
-        fit_normalization(FeatureStore.open(tiny_store(tmp_path)), np.arange(0), WINDOWS)
-
-
 @pytest.mark.parametrize("chunk_bytes", [300, 2**26])
 def test_threads_change_no_bit(tiny_store, tmp_path, monkeypatch, chunk_bytes):
     monkeypatch.setattr("pipeline.train.statistics.CHUNK_BYTES", chunk_bytes)

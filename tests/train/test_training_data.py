@@ -89,8 +89,3 @@ def test_renamed_episodes_are_told_by_their_content(store):
     }
     groups = groups_of(store, named, np.array([5, 31, 63]))
     assert groups.tolist() == ["group of right_001", "group of left_000", "group of left_old"]
-
-
-def test_an_episode_that_is_gone_is_not_hidden_by_one_under_its_name(store):
-    with pytest.raises(CheckpointMismatch, match=r"of the 2 test episodes .* 1 are missing"):
-        find(store, parts(left_000=(0, 7, "removed since"), left_009=(0, 9, "0-0")))

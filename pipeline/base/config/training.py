@@ -36,7 +36,7 @@ class FeatureEncoderParams(Section):
 
 
 class SensorEncoderParams(Section):
-    """Sizes of the sensor encoder; its parameters and cost are printed when training begins."""
+    """Sizes of the sensor encoder; its parameters are counted when training begins."""
 
     kind: Literal["joint", "force_aware"] = "joint"
     """joint: one branch for all channels. force_aware: force has its own and is not lost."""
@@ -80,13 +80,6 @@ class ExpertParams(Section):
     """Dropout during training."""
 
 
-class RegressionParams(Section):
-    """Params of the regression expert only."""
-
-    refinements: int = Field(default=1, ge=1, le=100)
-    """Rounds of prediction; the first starts from zeros, each later one from the round before."""
-
-
 class DiffusionParams(Section):
     """Params of the diffusion expert only."""
 
@@ -95,8 +88,6 @@ class DiffusionParams(Section):
     is computed once for all of them."""
     timesteps: int = Field(default=100, ge=2, le=10_000)
     """Steps of the noise schedule."""
-    schedule: Literal["cosine", "linear"] = "cosine"
-    """How the noise grows over the steps."""
     prediction: Literal["epsilon", "sample", "v"] = "sample"
     """What the network predicts: the noise, the clean chunk, or the velocity between them."""
     sampler: Literal["ddpm", "ddim"] = "ddim"
@@ -124,15 +115,8 @@ class FlowMatchingParams(Section):
     """Draws of noise and time per chunk in a training step, as in `diffusion.draws`."""
     sampling_steps: int = Field(default=4, ge=1, le=10_000)
     """Steps of the ODE solver."""
-    solver: Literal["euler", "midpoint", "rk4"] = "euler"
-    """ODE solver: one, two or four evaluations of the network per step."""
-    time: Literal["uniform", "beta"] = "beta"
-    """Distribution of the times in training."""
-    alpha: float = Field(default=1.5, gt=0, le=1e3)
-    """First parameter of the beta distribution of the noise's share 1 - t: larger than `beta` draws
-    noisy times more often (Black et al. 2024)."""
-    beta: float = Field(default=1.0, gt=0, le=1e3)
-    """Second parameter of that beta distribution."""
+    solver: Literal["euler", "rk4"] = "euler"
+    """ODE solver: one or four evaluations of the network per step."""
 
 
 class SplitParams(Section):
@@ -193,7 +177,6 @@ class TrainHeadParams(Section):
     sensor_encoder: SensorEncoderParams = SensorEncoderParams()
     state_encoder: StateEncoderParams = StateEncoderParams()
     expert: ExpertParams = ExpertParams()
-    regression: RegressionParams = RegressionParams()
     diffusion: DiffusionParams = DiffusionParams()
     flow_matching: FlowMatchingParams = FlowMatchingParams()
     drop_features: Fraction = 0.0

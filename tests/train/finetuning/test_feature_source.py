@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -48,13 +49,23 @@ def weights(module: nn.Module) -> dict[str, torch.Tensor]:
     return {n: p.detach().clone() for n, p in module.named_parameters() if p.requires_grad}
 
 
-def test_all_that_learns_does_at_its_own_rate_and_the_loss_falls(params):
+def test_all_that_learns_does_at_its_own_rate_and_the_loss_falls(params, monkeypatch):
     still = {"dim": 16, "layers": 1, "heads": 2, "dropout": 0.0}
     given = params(
         train_head={"expert": still, "min_lr_fraction": 1.0},
-        finetune={"batch_size": 8, "max_steps": 24, "eval_every": 24, "checkpoint_every": 24},
+        finetune={
+            "batch_size": 8,
+            "max_steps": 24,
+            "eval_every": 24,
+            "eval_ticks": 3,
+            "checkpoint_every": 24,
+        },
     )
     made = trainer(given)
+    plans, feed = list[Any](), made.source.feed
+    monkeypatch.setattr(
+        made.source, "feed", lambda plan, *of: (plans.append(plan), feed(plan, *of))[1]
+    )
     names = {id(p): n for n, p in made.module.named_parameters()}
     for group in made.optimizer.param_groups:
         for parameter in group["params"]:
@@ -70,6 +81,7 @@ def test_all_that_learns_does_at_its_own_rate_and_the_loss_falls(params):
     assert [n for n in before if torch.equal(before[n], after[n])] == []
     losses = made.history.tensor()[:, made.history.columns.index("loss")]
     assert losses[-6:].mean() < 0.7 * losses[:6].mean()
+    assert sum(len(draw.ticks) for draw in plans[-1]) == 3, "its own limit of val ticks"
 
 
 def test_what_is_kept_is_the_averaged_model_that_was_judged(params, tmp_path):

@@ -8,9 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from pipeline.base.config import TuningParams
 from pipeline.base.errors import RecordingError
-from pipeline.policy.observation import LiveObservation
 from pipeline.store import Batch, FeatureStore
 from pipeline.train.batches import BatchIndices, Windows
 from pipeline.train.finetuning_rows import (
@@ -20,7 +18,6 @@ from pipeline.train.finetuning_rows import (
     find_recordings,
     known_digests,
 )
-from pipeline.vlm.live import LiveVLM
 from pipeline.vlm.preparation import Preparer
 
 WINDOWS = Windows(2, 1, 3)
@@ -64,19 +61,6 @@ def test_batches_are_the_stores_and_rows_those_of_their_ticks(store, feed):
             seen += 1
         assert batches.waited_s > 0
     assert seen == len(plan)
-
-
-def test_an_untuned_model_gives_the_cached_features(store, feed, params):
-    with known_digests(store) as digests:
-        spec = check_spec(store, params(), digests)
-    vlm = LiveVLM.load(params().vlm, spec, TuningParams(method="none"), "cpu").eval()
-    with feed([BatchIndices(np.arange(0, store.ticks, 5))]) as batches, torch.no_grad():
-        _, batch = next(batches)
-        features, valid = vlm(batch.rows)
-    assert isinstance(batch, LiveObservation)
-    assert torch.equal(valid[batch.row_of], batch.slot_valid)
-    assert not batch.slot_valid.all(), "one recording lacks a view"
-    torch.testing.assert_close(features[batch.row_of], batch.features, atol=2e-5, rtol=1e-4)
 
 
 def test_another_device_takes_the_tensors_and_leaves_the_rows(store, feed):

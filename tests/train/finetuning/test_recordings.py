@@ -68,16 +68,9 @@ def test_the_model_of_the_store_is_asked_for(store, params):
         check_spec(store, params(extract={"dtype": "float16"}), digests)
 
 
-@pytest.mark.parametrize(
-    ("changed", "entry"),
-    [
-        ({"pooling": ["last"]}, "slots: "),
-        ({"image_resize_height": 84}, "processor.image_size"),
-    ],
-)
-def test_another_model_is_refused_with_the_entries_that_differ(store, params, changed, entry):
-    vlm = json.loads(params().vlm.model_dump_json()) | changed
+def test_another_model_is_refused_with_the_entries_that_differ(store, params):
+    vlm = json.loads(params().vlm.model_dump_json()) | {"image_resize_height": 84}
     with known_digests(store) as digests, pytest.raises(StoreMismatch) as refused:
         check_spec(store, params(vlm=vlm), digests)
-    assert entry in str(refused.value)
+    assert "processor.image_size" in str(refused.value)
     assert "train_head.store" in str(refused.value)

@@ -5,11 +5,9 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-import pytest
 from numpy.typing import NDArray
 
 from pipeline.base.config import Params
-from pipeline.base.errors import RecordingError
 from pipeline.data.episode import by_episode
 from pipeline.extract import extract
 from pipeline.simulation.insertion_formats import write_lerobot
@@ -89,12 +87,3 @@ def test_kept_rows_stay_within_their_bytes(store, params):
     for _ in range(2):
         none.prepare(np.array([last.start]))
     assert watched.keys.total() == 2
-
-
-def test_a_frame_that_is_gone_is_named(store, params, own_recordings):
-    rows, _ = live_rows(store, params())
-    rows.prepare(np.array([0]))
-    for frame in (own_recordings / "Follow_disc" / "episode_0" / "images" / "View1").iterdir():
-        frame.unlink()
-    with pytest.raises(RecordingError, match=r"episode_0/images/View1/.*\.jpg"):
-        rows.prepare(np.array([1]))
