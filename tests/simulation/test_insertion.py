@@ -222,6 +222,19 @@ def test_the_demonstrator_reacts_to_a_push_only_after_its_reaction_time() -> Non
     assert differs.index(True) + 1 - moved.index(True) == REACTION_TICKS
 
 
+def test_both_rotation_conventions_lead_to_the_same_episode() -> None:
+    by_vector, by_angles = NeedleInsertion("rotvec"), NeedleInsertion("euler_delta")
+    by_vector.reset(1)
+    by_angles.reset(1)
+    for _ in range(15):
+        by_vector.step(by_vector.expert_action())
+        before, action = by_angles.setpoint, by_angles.expert_action()
+        by_angles.step(action)
+        np.testing.assert_allclose(by_angles.setpoint - before, action[:6], atol=1e-9)
+    # Angles are added to a setpoint that leads the pose that they were computed at.
+    np.testing.assert_allclose(by_vector.knots[-1].pose, by_angles.knots[-1].pose, atol=0.02)
+
+
 def test_poses_between_ticks_are_what_the_arm_passed() -> None:
     insertion = NeedleInsertion()
     insertion.reset(5)
