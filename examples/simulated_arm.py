@@ -24,15 +24,15 @@ def main(url: str = "ws://127.0.0.1:8000", seed: int = 1_000_000) -> None:
         readings, info = arm.reset(seed=seed)
         executor = Executor("none", 1, client.metadata["horizon"], client.metadata["moving"])
         client.reset(seed)
-        done = late = False
-        while not (done or late):
-            taken = {f"images_time/{view}": time for view, time in info["frame_time"].items()}
+        while "reason" not in info:
+            frames = arm.frames().items()
+            taken = {f"images/{view}": frame for view, (_, frame) in frames}
+            times = {f"images_time/{view}": time for view, (time, _) in frames}
             executor.begin()
-            answer = client.infer({**readings, **taken})
+            answer = client.infer({**readings, **taken, **times})
             executor.plan(answer["actions"])
-            readings, _, done, late, info = arm.step(executor.next_action())
-            age, whole = answer["feature_age_s"], answer["server_timing"]["infer_ms"]
-            print(f"{readings['time'][0]:5.1f} s  features {age:.2f} s old, answer {whole:6.1f} ms")
+            readings, *_, info = arm.step(executor.next_action())
+            print(f"{readings['time'][0]:5.1f} s  features {answer['feature_age_s']:.2f} s old")
     print(info["reason"])
 
 

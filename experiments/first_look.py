@@ -90,7 +90,7 @@ def _recorded(moments: bool) -> Iterator[Seen]:
 def _simulated(episodes: int) -> Iterator[Seen]:
     for level in get_args(Level):
         for seed in range(FIRST_SEED, FIRST_SEED + episodes):
-            robot = InsertionEnvironment(level, cameras=False)
+            robot = InsertionEnvironment(level)
             robot.reset(seed=seed)
             frames = {view: frame for view, (_, frame) in robot.frames().items()}
             yield f"simulated, {level}", frames, robot.readings()["state"]

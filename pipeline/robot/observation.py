@@ -150,13 +150,10 @@ class ObservationReader:
         return newest_s
 
     def _guide(self, given: Mapping[str, Any]) -> PlanGuide | None:
-        names = [name for name in ("guide/chunk", "guide/weight") if name in given]
-        if not names:
+        if not {"guide/chunk", "guide/weight"} & given.keys():
             return None
-        if len(names) == 1:
-            raise ObservationError(f"{names[0]}: expected guide/chunk and guide/weight, found one")
-        chunk = _numbers("guide/chunk", given["guide/chunk"], self._chunk, np.float32)
-        weight = _numbers("guide/weight", given["guide/weight"], self._chunk[:1], np.float32)
+        chunk = _numbers("guide/chunk", given.get("guide/chunk"), self._chunk, np.float32)
+        weight = _numbers("guide/weight", given.get("guide/weight"), self._chunk[:1], np.float32)
         if not ((weight >= 0) & (weight <= 1)).all():
             raise ObservationError("guide/weight: expected 0 to 1, found something beyond")
         return PlanGuide(chunk, weight)

@@ -309,10 +309,13 @@ class PolicyServer:
         """The answer to an HTTP request; None where it opens a websocket."""
         path = request.path.partition("?")[0]
 
-        def respond(status: HTTPStatus, text: str, **headers: str) -> Response:
+        def respond(status: HTTPStatus, text: str, kind: str = "text/plain") -> Response:
             if status in _TURNED_AWAY:
                 self.status.note("turned away", _address(connection), text)
-            return _response(connection, status, f"{text}\n", **headers)
+            response = connection.respond(status, f"{text}\n")
+            del response.headers["Content-Type"]
+            response.headers["Content-Type"] = kind
+            return response
 
         if path == "/healthz":
             return respond(HTTPStatus.OK, "OK")
@@ -320,10 +323,9 @@ class PolicyServer:
             return respond(HTTPStatus.FORBIDDEN, "web pages are not served")
         if not self._is_authorized(request):
             why = "expected the header Authorization: Api-Key <the server's token>"
-            return respond(HTTPStatus.UNAUTHORIZED, why, **{"WWW-Authenticate": "Api-Key"})
+            return respond(HTTPStatus.UNAUTHORIZED, why)
         if path == "/status.json":
-            kind = {"Content-Type": "application/json"}
-            return respond(HTTPStatus.OK, self.status.json(), **kind)
+            return respond(HTTPStatus.OK, self.status.json(), "application/json")
         if path != "/":
             why = "expected a websocket at /, /healthz or /status.json"
             return respond(HTTPStatus.NOT_FOUND, why)
@@ -337,17 +339,6 @@ class PolicyServer:
             return True
         given = ",".join(request.headers.get_all("Authorization")).encode()
         return hmac.compare_digest(given, f"Api-Key {self._token}".encode())
-
-
-def _response(
-    connection: ServerConnection, status: HTTPStatus, text: str, **headers: str
-) -> Response:
-    response = connection.respond(status, text)
-    headers |= {"Cache-Control": "no-store", "X-Content-Type-Options": "nosniff"}
-    for name, value in headers.items():
-        response.headers.pop(name, None)
-        response.headers[name] = value
-    return response
 
 
 def _address(connection: ServerConnection) -> str:

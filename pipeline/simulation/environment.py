@@ -38,7 +38,7 @@ from pipeline.simulation.insertion import (
 from pipeline.simulation.interface import EnvironmentRobot, Readings, RobotEnvironment, Shots
 from pipeline.simulation.needle_sensor import READING_HZ
 from pipeline.simulation.recorder import CAMERA_HZ, CAMERA_JITTER_S, LOST_FRAMES
-from pipeline.simulation.rendering import HEIGHT, VIEWS, WIDTH, photograph, through_jpeg
+from pipeline.simulation.rendering import VIEWS, photograph, through_jpeg
 
 _LARGEST_ACTION: Final = 5.0
 """mm and degrees in a tick, over four times what the arm can do."""
@@ -52,30 +52,20 @@ class InsertionEnvironment(RobotEnvironment):
 
     It is dx dy dz in mm in the base frame, rotation in degrees in the convention of
     `action_rotation`, and gripper (ignored). An observation has `state` (10, 12) and `sensor` (65,
-    1026), the readings of the tick that ends now, `state_time`, `sensor_time` and `time` (1,) in s,
-    and with `cameras` `images/<view>` (126, 224, 3) RGB, the newest frames; `info["frame_time"]`
-    says when these were taken. Reward 1 for success; `info` has `success` and, at the end, its
-    `reason`.
+    1026), the readings of the tick that ends now, `state_time`, `sensor_time` and `time` (1,),
+    all times in s. Reward 1 for success; `info` has `success` and, at the end, its `reason`.
     """
 
-    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": TICK_HZ}  # noqa: RUF012
     draws_in_threads = True
 
-    def __init__(
-        self,
-        level: Level = "full",
-        action_rotation: ActionRotation = "rotvec",
-        cameras: bool = True,
-        render_mode: str | None = None,
-    ) -> None:
-        """Without `cameras` frames are drawn only when `frames` is called.
+    def __init__(self, level: Level = "full", action_rotation: ActionRotation = "rotvec") -> None:
+        """The environment at this level, with actions of this convention.
 
         Raises `ValueError` for an unknown level or convention of rotations.
         """
         for value, known in ((level, get_args(Level)), (action_rotation, get_args(ActionRotation))):
             if value not in known:
                 raise ValueError(f"expected one of {', '.join(known)}, found {value!r}")
-        self.render_mode = render_mode
         self.level: Level = level
         self.insertion = NeedleInsertion(action_rotation)
         self.robot = EnvironmentRobot(
@@ -89,19 +79,16 @@ class InsertionEnvironment(RobotEnvironment):
             state=STATE,
             sensor=SENSOR,
         )
-        self._cameras = cameras
         self.action_space = Box(-_LARGEST_ACTION, _LARGEST_ACTION, (7,), np.float32)
-        spaces: dict[str, Any] = {
-            "state": Box(-1e4, 1e4, (_STATES_PER_TICK, len(STATE.names)), np.float32),
-            "state_time": Box(0, 1e4, (_STATES_PER_TICK,), np.float64),
-            "sensor": Box(-1e4, 1e4, (READINGS_PER_TICK, len(SENSOR.names)), np.float32),
-            "sensor_time": Box(0, 1e4, (READINGS_PER_TICK,), np.float64),
-            "time": Box(0, 1e4, (1,), np.float64),
-        }
-        if cameras:
-            image = (HEIGHT, WIDTH, 3)
-            spaces |= {f"images/{view}": Box(0, 255, image, np.uint8) for view in VIEWS}
-        self.observation_space = Dict(spaces)
+        self.observation_space = Dict(
+            {
+                "state": Box(-1e4, 1e4, (_STATES_PER_TICK, len(STATE.names)), np.float32),
+                "state_time": Box(0, 1e4, (_STATES_PER_TICK,), np.float64),
+                "sensor": Box(-1e4, 1e4, (READINGS_PER_TICK, len(SENSOR.names)), np.float32),
+                "sensor_time": Box(0, 1e4, (READINGS_PER_TICK,), np.float64),
+                "time": Box(0, 1e4, (1,), np.float64),
+            }
+        )
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -137,16 +124,13 @@ class InsertionEnvironment(RobotEnvironment):
         """The newest observation."""
         now = self.insertion
         begun = now.time_s - TICK_S
-        readings = {
+        return {
             "state": now.state,
             "state_time": begun + np.arange(1, _STATES_PER_TICK + 1) / STATE_HZ,
             "sensor": now.sensor,
             "sensor_time": begun + np.arange(1, READINGS_PER_TICK + 1) / READING_HZ,
             "time": np.array([now.time_s]),
         }
-        if self._cameras:
-            readings |= {f"images/{view}": frame for view, (_, frame) in self.frames().items()}
-        return readings
 
     def frames(self) -> Shots:
         """The newest frame (126, 224, 3) of each camera, as a recording has it."""
@@ -154,10 +138,6 @@ class InsertionEnvironment(RobotEnvironment):
             view: (time, through_jpeg(photograph(view, self.insertion, time)))
             for view, time in self.frame_times().items()
         }
-
-    def render(self) -> NDArray[np.uint8]:  # pyright: ignore[reportIncompatibleMethodOverride]
-        """The newest frames side by side."""
-        return np.concatenate([frame for _, frame in self.frames().values()], axis=1)
 
     def frame_times(self) -> Mapping[str, float]:
         """When the newest frame of each camera was taken, in s."""
@@ -186,8 +166,7 @@ class InsertionEnvironment(RobotEnvironment):
 
     def _info(self) -> dict[str, Any]:
         outcome = self.insertion.outcome
-        info = {"success": outcome == INSERTED, "frame_time": self.frame_times()}
-        return info | ({"reason": outcome} if outcome else {})
+        return {"success": outcome == INSERTED} | ({"reason": outcome} if outcome else {})
 
 
 class SimulatedRobot:
@@ -204,7 +183,7 @@ class SimulatedRobot:
         self._hz, self._clock, self._scale = hz, clock, TICK_HZ / hz
         self.stopped: str | None = None
         """The reason of `stop`; None before it."""
-        self._environment = InsertionEnvironment(cameras=False)
+        self._environment = InsertionEnvironment()
         self._unread: list[Readings] = [self._environment.reset(seed=seed)[0]]
         self._steps, self._began_s = 0, math.nan
         self._newest = self._taken()
@@ -286,7 +265,7 @@ def environment_maker(
     kind, _, task = name.partition(":")
     if name == PHANTOM:
         rotation = "rotvec" if "rx" in action_names else "euler_delta"
-        return lambda: InsertionEnvironment(level, rotation, cameras=False)
+        return lambda: InsertionEnvironment(level, rotation)
     if kind == "metaworld":
         from pipeline.simulation.meta_world import MetaWorldEnvironment
 

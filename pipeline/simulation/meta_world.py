@@ -69,21 +69,12 @@ class MetaWorldEnvironment(RobotEnvironment):
     seed gives the same episode, bit for bit on one machine, whatever was played before.
     """
 
-    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": HZ}  # noqa: RUF012
-
-    def __init__(
-        self,
-        task: str,
-        image: int = 224,
-        shadows: bool = False,
-        render_mode: str | None = None,
-    ) -> None:
+    def __init__(self, task: str, image: int = 224, shadows: bool = False) -> None:
         """Frames are (`image`, `image`, 3); with `shadows` they have reflections, too.
 
         Raises `ConfigError` for an unknown task, and where Meta-World is not installed.
         """
         name = full_name(task)
-        self.render_mode = render_mode
         self.robot = EnvironmentRobot(
             name=f"metaworld:{name}",
             level=name,
@@ -180,14 +171,6 @@ class MetaWorldEnvironment(RobotEnvironment):
 
     def frames(self) -> Shots:
         """The frame of now, drawn when this is called."""
-        return {VIEW: (self.time_s, self.render())}
-
-    def frame_times(self) -> Mapping[str, float]:
-        """Now: nothing is drawn."""
-        return {VIEW: self.time_s}
-
-    def render(self) -> NDArray[np.uint8]:  # pyright: ignore[reportIncompatibleMethodOverride]
-        """The frame of now."""
         import mujoco
 
         renderer = _renderer(self._task, self._image)
@@ -195,15 +178,11 @@ class MetaWorldEnvironment(RobotEnvironment):
         flags: Any = mujoco.mjtRndFlag  # pyright: ignore[reportAttributeAccessIssue]
         for flag in (flags.mjRND_SHADOW, flags.mjRND_REFLECTION):
             renderer.scene.flags[flag] = self._shadows
-        return np.ascontiguousarray(renderer.render()[::-1, ::-1])
+        return {VIEW: (self.time_s, np.ascontiguousarray(renderer.render()[::-1, ::-1]))}
 
-
-def choose_drawing(environment: Mapping[str, str]) -> str | None:
-    """What `MUJOCO_GL` should be; None where it is set, or where there is a display."""
-    if "MUJOCO_GL" in environment or environment.get("DISPLAY"):
-        return None
-    gpu = any(map(os.path.exists, ("/dev/dri", "/dev/nvidiactl")))
-    return "egl" if gpu and find_library("EGL") else "osmesa"
+    def frame_times(self) -> Mapping[str, float]:
+        """Now: nothing is drawn."""
+        return {VIEW: self.time_s}
 
 
 def _meta_world() -> Any:
@@ -211,7 +190,9 @@ def _meta_world() -> Any:
 
     Raises `ConfigError` where it is not installed.
     """
-    if (drawing := choose_drawing(os.environ)) is not None:
+    if not {"MUJOCO_GL", "DISPLAY"} & os.environ.keys():
+        gpu = any(map(os.path.exists, ("/dev/dri", "/dev/nvidiactl")))
+        drawing = "egl" if gpu and find_library("EGL") else "osmesa"
         os.environ["MUJOCO_GL"] = drawing  # MuJoCo reads it when it is imported
     try:
         from metaworld import env_dict, policies

@@ -121,7 +121,7 @@ def test_robots_share_a_pass_of_the_model_and_are_told_the_task() -> None:
     assert len(glance.passes) == -(-(longest - 1) // 3)
     assert set(glance.instructions) == {INSTRUCTION}
     # What the model sees has been through the recorder's JPEG.
-    robot = InsertionEnvironment("full", cameras=False)
+    robot = InsertionEnvironment("full")
     robot.reset(seed=77)
     for view, (time, frame) in robot.frames().items():
         np.testing.assert_array_equal(glance.passes[0][0][view], frame)

@@ -165,7 +165,6 @@ def test_names_that_differ_are_mapped() -> None:
         ({"state": ("wrist",)}, "needs wrist, found no wrist or wrist.pos"),
         ({"action": MOTORS[:2], "moving": (False,) * 2}, r"none for \['gripper.pos'\]"),
         ({"kind": "velocity"}, "needs actions that are velocity, found places"),
-        ({"views": ("View1", "View2")}, "needs View2, found no View2"),
         ({"views": ()}, r"needs mappings of what it has, found \['View1'\]"),
     ],
 )

@@ -57,13 +57,6 @@ def test_limits_say_whose_readings_they_need() -> None:
     assert limits(JOINTS, step={"most": {"a": 1.0}}).streams == {"state"}
 
 
-def test_what_is_within_its_limits_is_sent_as_it_is() -> None:
-    own = limits(step={"most": {"translation": 1.0}}, speed={"most": {"dz": 5.0}})
-    action = moved(0.6, 0.6, 0.4)
-    assert own.allow(action) is action
-    assert (own.clipped, own.hz) == (0, HZ)
-
-
 @pytest.mark.parametrize(
     ("file", "action", "said"),
     [
@@ -103,27 +96,16 @@ def test_what_is_clipped_to_one_limit_is_judged_by_the_next() -> None:
         limits(**both, acceleration={"most": {"dx": 49}}).allow(moved(0.9))
 
 
-@pytest.mark.parametrize("on_exceed", ["stop", "clip"])
-def test_a_clip_that_would_undo_an_earlier_limit_stops(on_exceed: str) -> None:
+def test_a_clip_that_would_undo_an_earlier_limit_stops() -> None:
     own = limits(
-        speed={"most": {"translation": 10.0}, "on_exceed": on_exceed},
+        speed={"most": {"translation": 10.0}, "on_exceed": "clip"},
         acceleration={"most": {"dx": 5.0}, "on_exceed": "clip"},
     )
     for tick in range(20):
         own.allow(moved(0.05 * (tick + 1)))
-    with pytest.raises(SafeStop, match=r"speed of translation would be 13\.79, at most 10") as stop:
+    with pytest.raises(SafeStop, match=r"speed of translation would be 13\.79, at most 10"):
         own.allow(moved(0.0, 1.0))  # dx can only be slowed down to 0.95
-    assert stop.value.kind == StopKind.LIMIT
     assert own.clipped == 0
-
-
-def test_clips_of_the_same_channels_never_stop_each_other() -> None:
-    clips = {"most": {"translation": 7.0}, "on_exceed": "clip"}
-    own, rng = limits(step=clips, speed=clips, acceleration=clips), np.random.default_rng(0)
-    for _ in range(500):
-        sent = own.allow(moved(*rng.normal(0, 0.6, 3)))
-        assert np.linalg.norm(sent[:3]) * HZ <= 7.0 * (1 + 1e-6)
-    assert own.clipped > 250
 
 
 def test_channels_that_say_where_to_be_are_judged_by_where_the_robot_is() -> None:

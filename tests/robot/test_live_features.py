@@ -40,24 +40,6 @@ def test_live_features_are_the_stored_ones(params: Params) -> None:
     assert valid.all()
 
 
-@pytest.mark.parametrize(
-    ("changed", "named"),
-    [
-        ({"image_resize_width": 112}, r"processor\.resize: \[56, 84\] -> \[56, 112\]"),
-        ({"pooling": ("mean",)}, "slots: 49 entries -> 1 entries"),
-        ({"dtype": "bfloat16"}, 'compute_dtype: "float32" -> "bfloat16"'),
-    ],
-)
-def test_other_features_are_refused_before_a_weight_is_loaded(params, monkeypatch, changed, named):
-    def load(*args: Any) -> None:
-        raise AssertionError("a weight is loaded")
-
-    monkeypatch.setattr(LiveVLM, "load", load)
-    trained = FeatureStore.open(params.extract.store).spec
-    with pytest.raises(CheckpointMismatch, match=named):
-        LiveFeatures(params.vlm.model_copy(update=changed), trained, "cpu")
-
-
 def test_another_model_is_refused_before_a_weight_is_loaded(params, tmp_path, monkeypatch):
     monkeypatch.setattr(LiveVLM, "load", None)
     trained = FeatureStore.open(params.extract.store).spec
@@ -141,11 +123,6 @@ class TestRefused:
         assert "slots deviate by more than 1e-03 of their size" in said
         assert "layer 3 mean " in said or "layer 3 grid View" in said
         assert "and 43 more" in said and "The feature specs agree" in said
-
-    def test_a_model_that_gives_no_numbers(self, checkpoint, live):
-        with torch.no_grad():
-            next(live._model.model.language_model.layers[1].parameters()).fill_(torch.nan)
-        assert "layer 3 mean nan" in refusal(checkpoint, live)
 
     @pytest.mark.parametrize(
         "change",

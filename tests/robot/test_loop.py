@@ -1,7 +1,6 @@
 """Which step of which chunk is played, what is due in a tick, when a robot stands still."""
 
 from collections.abc import Iterator
-from itertools import product
 from typing import get_args
 
 import numpy as np
@@ -53,23 +52,6 @@ class TestDue:
             assert executor.next_action()[0] == tick
         assert observed == list(range(0, 20, execute))
 
-    def test_while_a_chunk_is_computed_no_other_is_due_and_a_late_one_is_as_old_as_its_observation(
-        self,
-    ):
-        executor = Executor("none", 4, HORIZON)
-        executor.begin()
-        assert not executor.due
-        executor.plan(chunk_of(0))
-        play(executor, 4)
-        assert executor.due
-        executor.begin()
-        play(executor, 3)
-        assert not executor.due
-        executor.plan(chunk_of(4))
-        assert not executor.due
-        play(executor, 1)
-        assert executor.due
-
     @pytest.mark.parametrize("execute", [0, 9])
     def test_more_steps_than_a_chunk_has_are_refused(self, execute: int) -> None:
         with pytest.raises(ConfigError, match=rf"rollout\.execute: expected 1 to 8.*{execute}"):
@@ -105,14 +87,6 @@ class TestSteps:
         assert executor.due and executor.begin() is None
         executor.plan(np.ones((HORIZON, 2)))
         assert play(executor, 2) == [1, 1]
-
-    def test_a_chunk_is_copied(self, chunking: Chunking) -> None:
-        executor, buffer = Executor(chunking, 2, HORIZON), chunk_of(0)
-        take(executor, buffer)
-        buffer[:] = -1
-        action = executor.next_action()
-        action[:] = -1
-        assert play(executor, 2) == [1, 2] and action.dtype == np.float32
 
     @given(st.lists(st.tuples(st.booleans(), st.integers(0, 3)), max_size=30))
     def test_whatever_the_delays_every_step_is_that_of_its_tick(self, chunking, turns):
@@ -190,15 +164,6 @@ class TestMoving:
             assert action.tolist() == pytest.approx([place - sent, 7.0])
             sent = place
 
-    def test_plans_that_agree_move_as_each_of_them(self) -> None:
-        """Deltas of other ticks do not: averaged, a robot that slows down never arrives."""
-        executor, sent = self.executor("temporal"), 0.0
-        for tick in range(30):
-            places = 1 - 0.5 ** (1 + tick + np.arange(HORIZON))
-            take(executor, np.diff(places, prepend=sent)[:, None] * [1, 0])
-            sent += float(executor.next_action()[0])
-            assert sent == pytest.approx(places[0])
-
     def test_what_was_cut_off_is_made_up_for_but_not_where_a_channel_says_where_to_be(self) -> None:
         executor = Executor("none", 3, 4, (True, True, False))
         take(executor, np.array([[1, 1, 5], [1, 1, 6], [1, 1, 7], [1, 1, 8]], np.float32))
@@ -260,11 +225,6 @@ class TestGuide:
         falling = [x * (np.e**x - 1) / (np.e - 1) for x in c]
         expected = [1, 1, *falling, 0, 0, 0]
         np.testing.assert_allclose(soft_mask(10, 2, 7), expected, rtol=1e-6)
-        for delay, overlap in product(range(HORIZON + 2), range(1, HORIZON + 1)):
-            weight = soft_mask(HORIZON, delay, overlap)
-            assert weight.dtype == np.float32 and (np.diff(weight) <= 0).all()
-            assert np.array_equal(weight == 1, np.arange(HORIZON) < min(delay, overlap))
-            assert np.array_equal(weight > 0, np.arange(HORIZON) < overlap)
 
     def test_robots_without_a_plan_weigh_nothing_in_a_batch(self) -> None:
         plan = PlanGuide(np.full((4, 2), 3, np.float32), np.full(4, 0.5, np.float32))
@@ -326,9 +286,3 @@ def test_the_model_looks_every_third_tick_and_the_head_answers_as_often_as_it_is
         assert [tick for tick, (began, *_) in enumerate(log) if began] == passes
         assert [tick for tick, (_, wanted, _) in enumerate(log) if wanted] == asked
         assert [tick for *_, tick in log] == [*[-1] * latency, *range(latency, 12)]
-
-
-def test_a_policy_without_features_needs_no_frames() -> None:
-    loop = make_loop(uses_features=False)
-    loop.begin_tick()
-    assert not loop.frames_due and loop.chunk_due

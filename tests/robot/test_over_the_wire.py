@@ -35,7 +35,6 @@ def over_the_wire(served: Any, serving: Served, **changed: Any) -> Rollouts:
     [
         ("regression", {"chunking": "temporal", "level": "moved", "latency_ms": [400, 100]}),
         ("flow_matching", {"chunking": "rtc"}),
-        ("diffusion", {}),
     ],
 )
 def test_the_same_seed_gives_the_same_episode_bit_for_bit(

@@ -4,42 +4,10 @@ from dataclasses import asdict
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from pipeline.robot.readings import ReadingWindow, RobotMemory, SeenFeatures
 from pipeline.store import FeatureStore
 from pipeline.train.batches import Windows
-
-
-@given(st.integers(1, 12), st.lists(st.integers(0, 20), max_size=12))
-def test_a_window_holds_the_newest_readings_at_its_end(size: int, counts: list[int]) -> None:
-    stream = np.arange(2 * sum(counts), dtype=np.float32).reshape(-1, 2) + 1
-    window, taken = ReadingWindow(size, 2, None), 0
-    for count in counts:
-        time_s = np.arange(taken, taken + count, dtype=np.float64)
-        window.append(stream[taken : taken + count], time_s)
-        taken += count
-        newest = stream[max(0, taken - size) : taken]
-        values, valid, ages = window.at(taken + 0.5)
-        assert valid == len(newest)
-        np.testing.assert_array_equal(values[size - valid :], newest)
-        np.testing.assert_array_equal(ages[size - valid :], np.arange(valid, 0, -1) + 0.5)
-        assert not values[: size - valid].any()
-        assert not ages[: size - valid].any()
-        np.testing.assert_array_equal(window.values, values)
-        times = [-np.inf] * (size - valid) + list(range(taken - valid, taken))
-        assert window.time_s.tolist() == times
-
-
-def test_what_is_older_than_the_window_is_no_reading_of_it() -> None:
-    window = ReadingWindow(5, 1, 0.3)
-    window.append(np.ones((4, 1), np.float32), np.array([0.1, 0.2, 0.3, 0.4]))
-    values, valid, ages = window.at(0.5)
-    assert valid == 3  # one is exactly as old as the window, but for rounding
-    np.testing.assert_allclose(ages, [0, 0, 0.3, 0.2, 0.1], atol=1e-7)
-    assert values.ravel().tolist() == [0, 0, 1, 1, 1]
-    assert window.at(9.0)[1] == 0  # the stream has stalled
 
 
 def sensed(time_s: float, **streams: np.ndarray) -> dict[str, np.ndarray]:

@@ -9,7 +9,6 @@ import signal
 import sys
 import threading
 import time
-import tracemalloc
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -544,18 +543,6 @@ def test_readings_that_cannot_be_checked_are_kept_from_the_recording(spoil, kind
     assert len(notes.ticks) == 9
 
 
-def test_parts_that_did_not_happen_in_a_tick_are_not_counted() -> None:
-    arm, brain = Arm(), Brain().after(0.02)
-    report = run_robot(arm, brain, CALM)
-    told = report.tick_timings.document()
-    with_frames = sum("images/View1" in asked for asked in brain.asked)
-    assert {part: told[part]["count"] for part in ("ask", "frames", "act", "observe", "tick")} == {
-        "ask": len(brain.asked), "frames": with_frames, "act": len(arm.acts),
-        "observe": report.ticks, "tick": report.ticks,
-    }  # fmt: skip
-    assert "record" not in told and len(brain.asked) < report.ticks
-
-
 @pytest.mark.parametrize(
     ("changed", "said"), [({"hz": 100.0}, r"hz=100, .* found 200"), ({"execute": 41}, "execute")]
 )
@@ -574,38 +561,6 @@ def test_the_process_is_afterwards_as_it_was() -> None:
     run_robot(Arm(moves=look), Brain(), replace(CALM, seconds=0.05))
     assert before == (sys.getswitchinterval(), gc.isenabled())
     assert set(within) == {(5e-4, False)}
-
-
-def test_a_thousand_ticks_more_need_no_more_memory(monkeypatch: pytest.MonkeyPatch) -> None:
-    sizes: dict[int, int] = {}
-
-    class Weighed(Brain):
-        """Forgets what it saw, and answers for long, that none is late."""
-
-        def infer(self, observation: Mapping[str, Any]) -> Mapping[str, Any]:
-            self.asked.clear()
-            answer = dict(super().infer(observation))
-            return answer | {"actions": np.zeros((self.metadata["horizon"], 2), np.float32)}
-
-    def weigh(tick: int, observed: Observed) -> None:
-        arm.acts.clear()
-        arm.began.clear()
-        if tick in (500, 1500):
-            sizes[tick] = tracemalloc.get_traced_memory()[0]
-            observed["ended"] = "weighed" if tick == 1500 else None
-
-    arm = Arm(weigh)
-    monkeypatch.setattr("pipeline.robot.run_report.KEPT", 100)
-    tracemalloc.start()
-    try:
-        settings = replace(CALM, hz=500.0, seconds=60, execute=50)
-        step = Limits(LimitsFile.model_validate({"step": {"most": {"dx": 1}}}), META, 500.0)
-        report = run_robot(arm, Weighed(horizon=300), settings, step)
-    finally:
-        tracemalloc.stop()
-    assert report.reason == "weighed"
-    # An observation kept is over 400 bytes; what waits for the next question differs a little.
-    assert sizes[1500] - sizes[500] < 200_000
 
 
 class TestThreads:

@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from PIL import Image
 
 from pipeline.base.config import Params, Source
 from pipeline.base.digests import file_digest
@@ -62,7 +61,7 @@ def drive(
     ticks: int | None = None,
 ) -> Driven:
     """The demonstrator's episode; every third tick is looked at."""
-    environment = InsertionEnvironment("full", cameras=False)
+    environment = InsertionEnvironment("full")
     observed, _ = environment.reset(seed=11)
     driven = Driven(RunRecorder(folder, metadata, INSTRUCTION, {"execute": 1}))
     recorder, tick = driven.recorder, 0
@@ -325,22 +324,6 @@ def test_a_run_that_stops_before_its_first_action_is_recorded(tmp_path) -> None:
         recording.action()
 
 
-def test_one_observation_that_a_kill_leaves_is_recovered(tmp_path, monkeypatch) -> None:
-    def kill(part: Path, end: Mapping[str, Any]) -> Path:
-        raise KeyboardInterrupt
-
-    recorder = RunRecorder(tmp_path, metadata_of(), "Push")
-    recorder.frames({"View1": (5.0, image_of(7))})
-    recorder.tick(observed_at(0, **state_at(0)), None)
-    with monkeypatch.context() as killed, pytest.raises(KeyboardInterrupt):
-        killed.setattr(recorder_module, "finish_recording", kill)
-        recorder.finish("never said")
-    recording = opened(recover(recorder.part))
-    found = recording.state()
-    assert found is not None and len(found.time) == 1
-    assert list(recording.cameras()) == ["View1"]
-
-
 def test_a_run_without_an_observation_is_no_recording_and_a_finished_one_not_recovered(tmp_path):
     recorder = RunRecorder(tmp_path, metadata_of(), "Push")
     with pytest.raises(RecordingError, match="the robot was never observed"):
@@ -355,16 +338,6 @@ def test_a_run_without_an_observation_is_no_recording_and_a_finished_one_not_rec
     with pytest.raises(RecordingError, match=r"expected what is left of a run, run_NNNNNN\.part"):
         recover(path)
     assert opened(path).action() is not None
-
-
-@pytest.mark.parametrize("shape", [(1, 1, 3), (37, 51, 3)])
-def test_a_png_has_the_very_pixels(tmp_path, shape: tuple[int, ...]) -> None:
-    image = np.random.default_rng(0).integers(0, 256, shape, np.uint8)
-    file = tmp_path / "frame.png"
-    file.write_bytes(encode_png(image))
-    with Image.open(file) as read:
-        assert read.mode == "RGB"
-        np.testing.assert_array_equal(np.asarray(read), image)
 
 
 def test_a_folder_that_cannot_be_made_is_named(tmp_path) -> None:

@@ -1,10 +1,9 @@
 """The harness vla-eval, as it is, asks a policy of ours and gets what the policy answers here."""
 
 import gc
-import runpy
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, ClassVar
+from typing import Any
 
 import anyio
 import numpy as np
@@ -13,19 +12,17 @@ import pytest
 from pipeline.base.config import load_params
 from pipeline.base.errors import ConfigError
 from pipeline.robot.loop import Executor
-from pipeline.robot.session import ServedPolicy
 from pipeline.simulation.insertion import INSTRUCTION
 from pipeline.simulation.rendering import VIEWS
 
 pytestmark = pytest.mark.extra
 api = pytest.importorskip("vla_eval.api", reason="needs the extra `vla-eval`")
-from vla_eval.benchmarks.base import StepBenchmark, StepResult  # noqa: E402
 from vla_eval.connection import Connection  # noqa: E402
 
 from experiments.vla_eval_server import PolicyModelServer  # noqa: E402
 
 ROOT = Path(__file__).parents[2]
-PARAMS, SERVER = ROOT / "params.yaml", ROOT / "experiments" / "vla_eval_server.py"
+PARAMS = ROOT / "params.yaml"
 CAMERAS = dict(zip(VIEWS, ("agentview", "wrist", "side", "top", "back"), strict=False))
 NAMES = {f"images/{view}": f"images/{camera}" for view, camera in CAMERAS.items()}
 NAMES |= {"state": "states"}
@@ -117,48 +114,6 @@ def test_its_client_gets_what_a_session_here_answers_bit_for_bit(
     assert not made.server._episodes  # What has ended is forgotten.
 
 
-class Countdown(StepBenchmark):
-    """Sends what `seen` says and keeps the actions; an episode succeeds after its last tick."""
-
-    played: ClassVar[list[list[np.ndarray]]] = []
-    asked: ClassVar[dict[str, Any]] = {}
-
-    def __init__(self, send_state: bool = False, send_wrist_image: bool = False) -> None:
-        super().__init__()
-        self.asked.update(state=send_state, wrist=send_wrist_image)
-
-    def get_tasks(self) -> list[dict[str, Any]]:
-        return [{"name": "count down"}]
-
-    def reset(self, task: Any) -> Any:
-        self.played.append([])
-        return task["episode_idx"], 0
-
-    def make_obs(self, raw_obs: Any, task: Any) -> dict[str, Any]:
-        return seen(*raw_obs)
-
-    def step(self, action: Any) -> StepResult:
-        self.played[-1].append(action["actions"])
-        tick = len(self.played[-1])
-        return StepResult((self._task["episode_idx"], tick), 0.0, tick == TICKS, {})
-
-    def get_step_result(self, step_result: StepResult) -> dict[str, Any]:
-        return {"success": step_result.done}
-
-
-def test_its_harness_runs_a_benchmark_to_the_end(serving_to_vla_eval, monkeypatch) -> None:
-    """`vla_eval.evaluate`, which is the command `vla-eval run` in one process."""
-    monkeypatch.setattr(Countdown, "played", [])
-    made = serving_to_vla_eval("regression")
-    benchmark = {"benchmark": f"{__name__}:Countdown", "episodes_per_task": 2, "max_steps": 20}
-    config = {"benchmarks": [benchmark]}
-    (result,) = api.evaluate(made.server, config, docker=False, no_save=True)
-    (task,) = result["tasks"]
-    assert [own["metrics"] for own in task["episodes"]] == [{"success": True}] * 2
-    np.testing.assert_array_equal(Countdown.played, [answered_here(made, k) for k in range(2)])
-    assert Countdown.asked == {"state": True, "wrist": True}
-
-
 def test_what_does_not_fit_is_refused_by_name_and_the_next_episode_runs(
     serving_to_vla_eval, caplog
 ) -> None:
@@ -181,26 +136,3 @@ def test_what_does_not_fit_is_refused_by_name_and_the_next_episode_runs(
     for override, why in (("execute=5", "expected 1 to 4"), ("chunking=rtc", "found rtc")):
         with pytest.raises(ConfigError, match=why):
             serving_to_vla_eval("regression", f"rollout.{override}")
-
-
-def test_the_command_serves_on_this_machine_only(served_policy, monkeypatch, capsys) -> None:
-    served, begun = served_policy("regression"), []
-    monkeypatch.setattr(ServedPolicy, "load", lambda folder, *_: begun.append(folder) or served)
-    monkeypatch.setattr("vla_eval.model_servers.serve.serve", lambda *own: begun.extend(own))
-    names = ("images/View1=images/a=b", "sensor=touch")
-    options = ("--params", str(PARAMS), "--set", "serve.port=8123", "--set", "serve.checkpoint=h")
-
-    def run(*arguments: str) -> Any:
-        monkeypatch.setattr("sys.argv", ["vla_eval_server", *arguments])
-        with pytest.raises(SystemExit) as end:
-            runpy.run_path(str(SERVER), run_name="__main__")
-        return end.value.code
-
-    assert run(*names, *options) == 0
-    folder, server, host, port = begun
-    assert (str(folder), host, port) == ("h", "127.0.0.1", 8123)
-    other = {"images/View1": "images/a=b", "sensor": "touch", "prompt": "task_description"}
-    assert server._names == {name: name for name in server._names} | other
-    assert {*server._names} == {*NAMES, "sensor", "prompt"}
-    assert run("states", *options) == 2
-    assert "error: states: expected some of images/View1" in capsys.readouterr().err

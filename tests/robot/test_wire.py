@@ -1,13 +1,12 @@
 """Messages are those of openpi-client, nothing of them is run, and all of them is bounded."""
 
 import pickle
-from contextlib import suppress
 from typing import Any
 
 import msgpack
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
@@ -71,24 +70,19 @@ def number_of(dtype: Any, value: Any) -> bytes:
 @pytest.mark.parametrize(
     ("data", "said"),
     [
-        (b"", "expected a message in msgpack"),
         (msgpack.packb({"a": 1})[:-1], "incomplete"),
-        (b"\xd6\xff\0\0\0\0", "expected a message in msgpack"),
         (b"\x91" * 100_000 + b"\xc0", "expected a message in msgpack"),
         (b"\x91" * 13 + b"\xc0", "at most 12 levels"),
         (msgpack.packb([[0] * 9999] * 3), "at most 20000 entries"),
         (msgpack.packb("x" * 1_000_001), "expected a message in msgpack"),
         (pickle.dumps(Trap()), "expected a message in msgpack"),
         (array_of("|O", [1], pickle.dumps(Trap())), "found '|O'"),
-        (array_of(b"<f4", [1], b"0" * 4), "plain numbers"),
         (array_of("<f4", [2], b"0" * 4), "expected 8 bytes"),
-        (array_of("<f4", [2**62, 4], b""), "expected 73786976294838206464 bytes"),
         (array_of("<f4", [-1], b""), "shape of an array"),
         (array_of("<f4", [1] * 9, b"0" * 4), "shape of an array"),
         (array_of("<f4", [1], "0000"), "expected 4 bytes for an array of float32, found str"),
         (number_of("<i2", 70_000), "expected a message in msgpack"),
         (number_of("<i2", "7"), "expected a number"),
-        (number_of("|u1", float("nan")), "expected a message in msgpack"),
     ],
 )  # fmt: skip
 def test_a_broken_message_is_one_error(data: bytes, said: str) -> None:
@@ -102,10 +96,3 @@ def test_a_message_may_be_as_long_as_the_caller_allows() -> None:
     assert len(wire.unpack(data, len(data))) == 100
     with pytest.raises(WireError, match="at most 100 bytes"):
         wire.unpack(data, 100)
-
-
-@given(st.binary(max_size=200))
-@settings(max_examples=500)
-def test_any_bytes_are_a_message_or_one_error(data: bytes) -> None:
-    with suppress(WireError):
-        wire.unpack(data)

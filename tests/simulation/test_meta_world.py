@@ -14,7 +14,6 @@ from pipeline.simulation.meta_world import (
     TIME_IS_UP,
     VIEW,
     MetaWorldEnvironment,
-    choose_drawing,
     instruction_of,
 )
 from tests.simulation.environment_contract import EnvironmentContract
@@ -45,11 +44,6 @@ def test_a_missing_package_names_the_extra(monkeypatch):
     monkeypatch.setitem(sys.modules, "metaworld", None)
     with pytest.raises(ConfigError, match=r"vla-feature-cache\[metaworld\]"):
         MetaWorldEnvironment("assembly")
-
-
-def test_a_display_or_a_choice_of_ones_own_decides_how_frames_are_drawn():
-    assert choose_drawing({"MUJOCO_GL": "glfw"}) is choose_drawing({"DISPLAY": ":0"}) is None
-    assert choose_drawing({}) in ("egl", "osmesa")
 
 
 def test_any_task_has_an_instruction():

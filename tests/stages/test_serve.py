@@ -69,7 +69,9 @@ def observe_phantom() -> dict[str, Any]:
     from pipeline.simulation.environment import InsertionEnvironment
 
     robot = InsertionEnvironment()
-    return robot.reset(seed=3)[0] | {"prompt": "Insert"}
+    readings, _ = robot.reset(seed=3)
+    frames = {f"images/{view}": frame for view, (_, frame) in robot.frames().items()}
+    return readings | frames | {"prompt": "Insert"}
 
 
 def test_what_cannot_be_served_is_refused_by_name(trained, monkeypatch, capsys):
