@@ -23,7 +23,7 @@ SECTIONS = ("push",)
 SHORTHANDS = (
     Shorthand("repo", "push.repo", "the repository", "OWNER/NAME", "?"),
     Shorthand("--folder", "push.folder", "a policy or a store", "FOLDER"),
-    Shorthand("--card", "push.card_only", "print the card and the files, upload nothing"),
+    Shorthand("--card", "push.card_only", "print the card, upload nothing"),
 )
 
 

@@ -37,7 +37,7 @@ from pipeline.evaluate.rollouts import (
     late_name,
 )
 from pipeline.policy.checkpoint import PolicyCheckpoint
-from pipeline.policy.observation import moving_channels, stream_of
+from pipeline.policy.observation import moving_channels
 from pipeline.policy.policy import Policy
 from pipeline.robot.client import PolicyClient
 from pipeline.robot.live_features import LiveFeatures, prove
@@ -92,11 +92,10 @@ def roll_out(
     if metadata["uses_features"]:
         features = load_features()
         prove(checkpoint, features, say)
-    alone = len(policy.encoders) == 1
     ablations: list[RolloutAblation] = [
         ablation
         for ablation in dict.fromkeys(wanted.ablations)
-        if ablation.split()[0] in policy.encoders and not (alone and ablation.endswith("off"))
+        if ablation.split()[0] in policy.encoders and len(policy.encoders) > 1
     ]
     for driver in drivers:
         driver.features = features
@@ -285,8 +284,6 @@ class _Robot(Generic[Memory]):
     time_s: float = 0.0
     under_way: tuple[float, Any] | None = None
     """When the current pass of the model ends, and its result; None without a pass."""
-    first: dict[str, NDArray[Any]] = field(default_factory=dict[str, NDArray[Any]])
-    """The fields of a frozen stream as they were first."""
 
     @property
     def environment(self) -> RobotEnvironment:
@@ -509,21 +506,15 @@ class _LocalDriver(_Driver[RobotMemory]):
     def answer(self, robots: Sequence[_Robot[RobotMemory]]) -> Chunk:
         """The chunks (robot, horizon, action) of one pass of the head.
 
-        A stream that is off keeps its true ages and gaps; all fields of a frozen one stay as they
-        were first.
+        A stream that is off keeps its true ages and gaps.
         """
         guides = [robot.loop.ask() for robot in robots]
         fields = [robot.memory.observation() for robot in robots]
         if (ablation := robots[0].ablation) is not None:
-            name, how = ablation.split()
+            name = ablation.split()[0]
             mean = self.checkpoint.typical(name).astype(np.float32)
-            for robot, own in zip(robots, fields, strict=True):
-                if how == "off":
-                    own[name] = np.broadcast_to(mean, own[name].shape)
-                else:
-                    now = {key: value for key, value in own.items() if stream_of(key) == name}
-                    robot.first = robot.first or now
-                    own |= robot.first
+            for own in fields:
+                own[name] = np.broadcast_to(mean, own[name].shape)
         streams = {name: np.stack([own[name] for own in fields]) for name in fields[0]}
         observation = self.policy.observe(streams)
         guide = stack_guides(guides, observation.features.device)

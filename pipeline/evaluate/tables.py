@@ -228,18 +228,18 @@ def ablation_table(study: AblationStudy) -> Table:
     groups = study.intact.varying_groups()
     rows: list[list[Any]] = []
 
-    def add(words: tuple[str, str], comparison: Comparison, method: str, times: object) -> None:
+    def add(words: tuple[str, str], times: object, comparison: Comparison, method: str) -> None:
         errors = (comparison.error(method, group) for group in (*groups, None))
-        rows.append([*words, *errors, times])
+        rows.append([*words, times, *errors])
 
-    add(("all", "intact"), study.intact, "policy", "1" if intact > 0 else None)
+    add(("all", "intact"), "1" if intact > 0 else None, study.intact, "policy")
     for way in study.ablated:
         times = study.times_intact(way)
-        add((way.stream, way.how), way.comparison, "policy", times and times.text())
+        add((way.stream, way.how), times and times.text(), way.comparison, "policy")
     blind = f"{study.intact.overall(best) / intact:.2f}" if intact > 0 else None
-    add(("none", HEADINGS[best]), study.intact, best, blind)
+    add(("none", HEADINGS[best]), blind, study.intact, best)
     names = map(_heading, (*groups, None))
-    heads = ["stream", "policy sees it", *names, "times intact"]
+    heads = ["stream", "policy sees it", "times intact", *names]
     return Table(heads, rows, caption=ABLATION_FOOTNOTE, strong=frozenset({0}))
 
 

@@ -37,11 +37,6 @@ def comparison_report(experiments: Sequence[Experiment]) -> Report:
         "lines."
     )
     picture = Picture("experiments", caption, partial(draw_experiments, experiments))
-    tiles = []
-    for span, words in SPANS.items():
-        best = best_experiment(experiments, span)
-        tiles.append((f"lowest error of {words} [training std]", best.error(span).text()))
-        tiles.append(("by", best.name))
     summary = (
         f"{len(experiments)} experiment(s) judged on the same test ticks, of "
         f"{len(experiments[0].groups)} group(s) of recordings."
@@ -52,7 +47,6 @@ def comparison_report(experiments: Sequence[Experiment]) -> Report:
         title="Experiments side by side",
         verdict=_verdict(experiments),
         summary=summary,
-        tiles=tuple(tiles),
         sections=(
             Section("Errors", (*tables, picture)),
             next_steps(

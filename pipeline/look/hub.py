@@ -20,8 +20,6 @@ if TYPE_CHECKING:
 
 _LIBRARY = "vla-feature-cache"
 _NOT_JUDGED = "No evaluation or rollout of these weights was at hand."
-_LISTED = 20
-"""The most files that `push.card_only` lists."""
 
 
 def push(params: Params, api: "HfApi", say: Callable[[str], None] = print) -> None:
@@ -50,9 +48,6 @@ def push(params: Params, api: "HfApi", say: Callable[[str], None] = print) -> No
         card = policy_card(load_policy(folder), wanted.repo, params.vlm.checkpoint, reports)
     if wanted.card_only:
         say(card)
-        largest = sorted(files.items(), key=lambda file: -file[1][1])
-        for name, (_, size) in largest[:_LISTED]:
-            say(f"{size / 1e6:10.2f} MB  {name}")
     size = sum(size for _, size in files.values())
     say(f"{folder}: {len(files)} files, {size / 1e6:.1f} MB, for the {kind} {wanted.repo}")
     if not wanted.card_only:

@@ -35,17 +35,13 @@ _INSERTION = (
 _TASK = "The environment itself says whether an episode succeeds, and with which reason it ends."
 _CONTROLLERS = (
     "The demonstrator is the rule that made the training data, and sees what the simulation hides. "
-    "With a stream off, the same policy sees its training mean; with one frozen, its first reading "
-    "forever; a state that is spoilt tells no motion since the frame, either. Late is the policy "
-    "with a model that takes so long for a pass. All of them meet the same episodes."
+    "With a stream off, the same policy sees its training mean. Late is the policy with a model "
+    "that takes so long for a pass. All of them meet the same episodes."
 )
 _MOMENTS = 8
-_NEAR_MM = 3.0
-"""How far from the target the picture of the paths reaches."""
 _WIDTH = 9.0
 _OTHER = "#999999"
 """Colour of an episode among many."""
-_OUTCOMES = {True: ("inserted", PALETTE[0], "o"), False: ("not inserted", PALETTE[5], "X")}
 _GOOD, _WIDE = 0.9, 0.15
 """A rate from which a policy may go on to an arm; a width of its interval that says little."""
 _THIN: dict[str, Any] = {"lw": 0.8, "alpha": 0.45, "rasterized": True}
@@ -79,7 +75,7 @@ def rollout_report(rollouts: Rollouts) -> Report:
                 [Text(_INSERTION if inserts else _TASK), Text(_CONTROLLERS), rollouts.summary()],
             ),
             *_lateness(rollouts),
-            *([Section("Where the needle went", _paths_and_courses(rollouts))] if inserts else []),
+            *([Section("Where the needle went", _courses(rollouts))] if inserts else []),
             Section("Episodes closely", (), tuple(_filmstrips(rollouts))),
             Section("What was run", [Outline("Settings of the rollout", rollouts.settings)]),
             next_steps(*_advice(rollouts)),
@@ -147,58 +143,15 @@ def _trace(episode: RolloutEpisode) -> InsertionTrace:
     return episode.trace
 
 
-def _paths_and_courses(rollouts: Rollouts) -> list[Block]:
+def _courses(rollouts: Rollouts) -> list[Block]:
     episodes = rollouts.of("policy")
-    above = (
-        "The path of the needle's tip as seen from the target. Points are where it punctured, or "
-        "where it ended when it never did; in the circle, an insertion may succeed. Where a push "
-        "moves the target, a line jumps. What lies farther is cut off."
-    )
     over_time = (
         "A thin line is an episode. The tip should be near the target before it goes below the "
         "surface, and come to rest in the green band. Force is the largest in each tick; it falls "
         "when the needle punctures."
     )
     strong = {f"{kind}, seed {e.seed}": e for kind, e in worst_and_median(episodes).items()}
-    return [
-        Picture("paths", above, partial(draw_paths, rollouts)),
-        Picture("courses", over_time, partial(draw_courses, episodes, strong)),
-    ]
-
-
-def draw_paths(rollouts: Rollouts) -> Figure:
-    """The last of the tip's paths of policy and demonstrator, seen from above."""
-    shown = [name for name in ("policy", "expert") if rollouts.of(name)]
-    figure, axes = panels(_WIDTH * max(len(shown), 1.4) / 2, 5.4, 1, len(shown), squeeze=False)
-    for axis, name in zip(axes[0], shown, strict=True):
-        _draw_all(axis, rollouts.of(name))
-        axis.set_title(f"{controller_name(name)}: the last {_NEAR_MM:g} mm")
-    finish(figure, axes[0, 0], 3, "Seen from above, the target in the middle")
-    return figure
-
-
-def _draw_all(axis: Axes, episodes: Sequence[RolloutEpisode]) -> None:
-    """Draw the path of each episode from where it last comes near."""
-    for episode in episodes:
-        offset_mm = _trace(episode).offset_mm
-        (outside,) = np.nonzero(np.abs(offset_mm).max(axis=1) > _NEAR_MM)
-        shown = offset_mm[outside[-1] if len(outside) else 0 :]
-        axis.plot(*shown.T, color=_OUTCOMES[episode.success][1], **_THIN)
-    around = MISS_MM * np.exp(2j * np.pi * np.arange(91) / 90)
-    label = f"{MISS_MM:g} mm from the target"
-    axis.plot(around.real, around.imag, color=INK, lw=1.6, zorder=6, label=label)
-    for outcome, (label, colour, marker) in _OUTCOMES.items():
-        ends = [_trace(episode).lateral_mm for episode in episodes if episode.success == outcome]
-        style: dict[str, Any] = {
-            "s": 34,
-            "color": colour,
-            "edgecolors": "white",
-            "lw": 0.6,
-            "zorder": 7,
-        }
-        axis.scatter(*np.reshape(ends, (-1, 2)).T, marker=marker, label=label, **style)
-    axis.set(xlim=(-_NEAR_MM, _NEAR_MM), ylim=(-_NEAR_MM, _NEAR_MM), aspect="equal")
-    axis.set(xlabel="x [mm]", ylabel="y [mm]")
+    return [Picture("courses", over_time, partial(draw_courses, episodes, strong))]
 
 
 def draw_courses(

@@ -39,8 +39,6 @@ EPISODES = 100
 """The most episodes in the table; if there are more, it has the first."""
 DEAD = 1e-3
 """A slot is dead if the spread of its numbers is below this share of their size."""
-_STALE_PERIODS = 2
-"""Features are old beyond this multiple of the period of VL rows."""
 _TINY = 1e-30
 
 
@@ -112,7 +110,6 @@ def inspect_store(path: str | Path, params: InspectParams) -> StoreView:
     keys = np.ascontiguousarray(store.array("vl/key")).view(f"V{KEY_BYTES}").ravel()
     issues = (
         *find_coverage_issues(episodes),
-        *find_age_issues(store, episodes, ages["newest frame"]),
         *find_feature_issues(health, episodes),
     )
     files = (file.stat() for file in store.path.rglob("*") if file.is_file())
@@ -254,19 +251,6 @@ def read_ages(store: FeatureStore) -> dict[str, NDArray[np.float32]]:
     ages = (store.array("tick/time")[:, None] - shown).astype(np.float32)
     newest = store.feature_age(np.arange(store.ticks)).astype(np.float32)
     return {"newest frame": newest} | dict(zip(store.streams["views"], ages.T, strict=True))
-
-
-def find_age_issues(
-    store: FeatureStore, episodes: Sequence[Coverage], ages: NDArray[np.float32]
-) -> Iterator[Issue]:
-    """Episodes whose ticks use features far older than a VL row serves; `ages` are (tick,) s."""
-    limit_s = _STALE_PERIODS * store.vlm_reuse_count * store.tick_step()
-    for part in episodes:
-        own = ages[part.episode.ticks.start : part.episode.ticks.stop]
-        if old := int(np.count_nonzero(own > limit_s)):
-            message = f"{old} of {len(own)} ticks see features up to {own.max():.2f} s old, over "
-            message += f"{limit_s:.2f} s, the time of {_STALE_PERIODS} VL rows"
-            yield part.issue("old frames", "vl/frame_time", message)
 
 
 def _reuse_blocks(view: StoreView, total: int) -> list[Block]:

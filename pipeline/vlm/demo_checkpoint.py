@@ -48,7 +48,7 @@ def _is_demo(folder: Path) -> bool:
     return config.is_file() and f'"vocab_size": {_VOCABULARY}' in config.read_text("utf-8")
 
 
-DEMO_CHECKPOINT = OutputKind("what the demo wrote", _is_demo)
+DEMO_CHECKPOINT = OutputKind("a demo", _is_demo)
 """It has the name of the demo's other outputs, because it is written into one of them."""
 
 

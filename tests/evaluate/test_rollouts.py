@@ -12,7 +12,6 @@ from pipeline.base.errors import CheckpointMismatch, ConfigError
 from pipeline.evaluate.rollout_driver import roll_out
 from pipeline.evaluate.rollouts import Rollouts, SuccessRate
 from pipeline.policy.checkpoint import PolicyCheckpoint
-from pipeline.policy.observation import stream_of
 from pipeline.policy.policy import Policy
 from pipeline.simulation.environment import InsertionEnvironment
 from pipeline.simulation.insertion import INSTRUCTION, MAX_TICKS, NeedleInsertion
@@ -184,46 +183,6 @@ def test_a_stream_that_is_off_says_nothing(monkeypatch: pytest.MonkeyPatch) -> N
         assert all(seen[other].any() and not (seen[other] == 0.25).all() for seen in silent)
         assert len({tuple(seen["feature_age"]) for seen in silent}) > 3
         assert all(seen["slot_valid"].all() and seen["feature_age"].max() < 0.4 for seen in silent)
-
-
-@pytest.mark.parametrize("stream", ["features", "state"])
-def test_a_frozen_stream_tells_what_it_told_first(stream, monkeypatch):
-    parts = made()
-    given = watch(monkeypatch, parts[1])
-    rollouts = rolled(parts, episodes=2, ablations=(f"{stream} frozen",))
-    assert rollouts.controllers == ("policy", f"{stream} frozen", "expert")
-    frozen = given[max(episode.ticks for episode in rollouts.of("policy")) :]
-    assert len(frozen) > 5
-    for robots in frozen:
-        for name in (key for key in robots if stream_of(key) == stream):
-            now = robots[name]
-            assert any(np.array_equal(now[0], first) for first in frozen[0][name]), name
-        assert len(now) == 1 or not (robots[stream][0] == robots[stream][1]).all()
-    assert not (frozen[0]["sensor"][0] == frozen[5]["sensor"][0]).all()
-
-
-def test_an_ensemble_leads_to_the_mean_of_the_places(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of a policy that always wants to move by one step, and of one whose steps change."""
-    parts = made()
-    sent: list[np.ndarray] = []
-    step = InsertionEnvironment.step
-
-    def watched(robot: Any, action: np.ndarray) -> Any:
-        sent.append(action.copy())
-        return step(robot, action)
-
-    def act(*_: Any) -> torch.Tensor:
-        chunk = torch.zeros(1, 4, 7)
-        chunk[..., 0] = 0.1 if len(sent) % 2 else -0.1
-        return chunk
-
-    monkeypatch.setattr(parts[1], "act", act)
-    monkeypatch.setattr(InsertionEnvironment, "step", watched)
-    rolled(parts, ablations=(), episodes=1, chunking="temporal")
-    # Places: -0.1, then the mean of -0.2 (the first chunk) and -0.1 + 0.1 (the second).
-    weights = np.exp([0, 0.2])
-    second = np.average([-0.2, 0.0], weights=weights) + 0.1
-    assert [action[0] for action in sent[:2]] == pytest.approx([-0.1, second], abs=1e-6)
 
 
 def test_streams_that_a_policy_lacks_are_passed_over() -> None:

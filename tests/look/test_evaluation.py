@@ -4,6 +4,7 @@ import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -87,6 +88,20 @@ def judgement(
         study=evaluate_ablation(checkpoint, policy, store, ticks, baselines, 64),
         judged=judged_document(checkpoint, policy, store, EvaluateParams()),
     )
+
+
+def test_trainings_that_differ_in_seed_or_fold_have_one_recipe(judgement: Evaluation) -> None:
+    def recipe(**changed: Any) -> str:
+        document = PARAMS.model_dump() | changed
+        params = TrainHeadParams.model_validate(document)
+        checkpoint = replace(judgement.checkpoint, params=params)
+        policy = judgement.checkpoint.policy()
+        judged = judged_document(checkpoint, policy, judgement.store, EvaluateParams())
+        return judged["policy"]["recipe"]
+
+    folds = [{"split": {"folds": 2, "fold": fold}, "seed": fold} for fold in (0, 1)]
+    assert recipe(**folds[0]) == recipe(**folds[1])
+    assert len({recipe(), recipe(**folds[0]), recipe(lr=0.5)}) == 3
 
 
 def section(report: Report, title: str) -> Section:

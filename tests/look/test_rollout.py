@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,18 +10,15 @@ import pytest
 from pipeline.base.text import Table
 from pipeline.evaluate.rollouts import InsertionTrace, RolloutEpisode, Rollouts
 from pipeline.look.page.blocks import Outline, Picture, Report
-from pipeline.look.page.style import canvas
 from pipeline.look.page.writing import PAGE, write_report
 from pipeline.look.rollout import (
     draw_filmstrip,
     draw_latency,
-    draw_paths,
     rollout_report,
     worst_and_median,
 )
-from pipeline.simulation.insertion import MISS_MM
 
-ALWAYS = {"paths", "courses", "filmstrip_worst"}
+ALWAYS = {"courses", "filmstrip_worst"}
 
 
 VIEWS = ("View1", "View2")
@@ -162,30 +158,6 @@ def test_without_any_success_and_of_one_episode_of_one_tick() -> None:
     assert drawn(report) >= ALWAYS
     assert report.sections[2].parts[0].title.startswith("Worst: seed 3")
     assert drawn(rollout_report(rollouts_of(rollout_episode(7, ticks=1)))) == ALWAYS
-
-
-def test_names_are_words_and_never_part_of_the_page(tmp_path: Path) -> None:
-    reason = "safe stop: <script>alert(1)</script> & $x_1$"
-    stopped = failed(reason=reason)
-    other = rollout_episode(1, controller="<b>off</b>")
-    named = rollouts_of(stopped, other)
-    report = rollout_report(replace(named, checkpoint="models/<i>head</i>"))
-    for picture in report.blocks(Picture):
-        object.__setattr__(picture, "draw", lambda: canvas(1, 1))  # their captions are looked at
-    write_report(tmp_path, report)
-    page = (tmp_path / PAGE).read_text()
-    assert "<script>alert" not in page and "<i>head" not in page and "<b>off" not in page
-    assert "&lt;script&gt;alert(1)&lt;/script&gt; &amp; $x_1$" in page
-
-
-def test_paths_end_by_success_and_begin_near(rollouts: Rollouts) -> None:
-    figure = draw_paths(rollouts)
-    assert [len(points.get_offsets()) for points in figure.axes[0].collections] == [3, 2]
-    circle = next(line for line in figure.axes[0].lines if "from the" in str(line.get_label()))
-    assert np.hypot(*circle.get_xydata().T) == pytest.approx(np.full(91, MISS_MM))
-    assert max(np.abs(line.get_xydata()[1:]).max() for line in figure.axes[0].lines[:5]) <= 3.0
-    without = replace(rollouts, episodes=rollouts.of("policy"))
-    assert len(draw_paths(without).axes) == 1
 
 
 def test_a_filmstrip_asks_for_frames_at_its_moments() -> None:

@@ -125,12 +125,6 @@ class TestIntegrity:
         with pytest.raises(StoreIncomplete, match=rf"{name}.*(trailer|offsets).*stages\.verify"):
             look(path)
 
-    def test_changed_metadata(self, path):
-        file = path / "zarr.json"
-        file.write_text(file.read_text().replace('"action_hz": 10.0', '"action_hz": 20.0'))
-        with pytest.raises(StoreIncomplete, match=r"metadata were changed.*stages\.verify"):
-            look(path)
-
 
 class TestIssues:
     def test_a_dead_slot(self, path, plant):
@@ -148,12 +142,6 @@ class TestIssues:
         assert [row[-1] for row in blocks(page, "Coverage")[-1].rows[:2]] == ["no View1", "all"]
         assert page.verdict == "1 finding to look at before training"
         assert "verify" in blocks(page, "What to do next")[0].words
-
-    def test_old_frames(self, path, plant):
-        plant(path, "vl/frame_time", lambda shown: np.subtract(shown[:ROWS], 1, out=shown[:ROWS]))
-        (issue,) = look(path).issues
-        assert (issue.kind, issue.episode) == ("old frames", "episode_000")
-        assert "up to 1." in issue.message and "over 0.60 s" in issue.message
 
     def test_an_episode_without_an_instruction(self, tiny_store, tmp_path, plant):
         path = tiny_store(tmp_path, episodes=12)

@@ -56,12 +56,6 @@ def test_two_for_bad_params_and_a_misspelt_key_is_recognised(capsys):
     assert "data.sources.1: expected either path or hub, found neither" in err
 
 
-def test_an_argument_that_is_none_is_named(capsys):
-    with pytest.raises(SystemExit, match="2"):
-        run("Summary.", print, ["--repare"])
-    assert capsys.readouterr().err.endswith("error: unrecognized arguments: --repare\n")
-
-
 SHORTHANDS = (
     Shorthand("--repair", "verify.repair", "mend"),
     Shorthand("--reextract", "verify.reextract", "rows", "N"),
@@ -230,9 +224,3 @@ def test_all_commands_are_listed(capsys):
     assert stages.__main__.main([]) == 0
     listed = capsys.readouterr().out
     assert sorted(re.findall(r"^  (\w+) +[A-Z]", listed, re.MULTILINE)) == STAGES
-
-
-def test_a_command_that_is_none_is_named(capsys):
-    with pytest.raises(SystemExit, match="2"):
-        stages.__main__.main(["extrakt"])
-    assert "invalid choice: 'extrakt' (choose from 'demo', 'extract'" in capsys.readouterr().err

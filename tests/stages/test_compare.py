@@ -103,37 +103,6 @@ def test_a_table_for_each_span_a_file_and_a_picture(experiments: Path, capsys: S
     assert all(name in page for name in NAMES)
 
 
-def test_seeds_become_one_row(experiments: Path) -> None:
-    """A training that differs by its seed alone has the same recipe."""
-    name, reports = "regression-concat-seed7", experiments.parent / "reports"
-    options = ["train_head.model_type=regression", "train_head.fusion_strategy=concat"]
-    assert evaluated(experiments, name, *options, "train_head.seed=7") == 0
-    found = {one.name: one for one in read_experiments(reports)}
-    assert sorted(found) == sorted(NAMES)
-    merged = found["regression-concat"]
-    assert merged.seeds == (0, 7)
-    for span, scope in (("executed", "executed"), ("overall", "chunk")):
-        of_seeds = []
-        for folder in ("regression-concat", name):
-            metrics = json.loads((reports / folder / "metrics.json").read_text())
-            of_seeds.append(metrics[scope]["overall"]["policy"]["value"])
-        assert merged.by_seed(span).tolist() == pytest.approx(of_seeds, rel=1e-4)
-    shutil.rmtree(reports / name)
-
-
-def test_folds_become_one_row_of_all_groups(experiments: Path) -> None:
-    reports = experiments.parent / "reports/folds"
-    for fold in (0, 1):
-        options = ["train_head.split.folds=2", f"train_head.split.fold={fold}"]
-        assert evaluated(experiments, f"folds/concat-fold{fold}", *options) == 0
-    (pooled,) = read_experiments(reports)
-    assert (pooled.name, pooled.folds, pooled.seeds) == ("concat", 2, (0,))
-    documents = [json.loads(path.read_text()) for path in sorted(reports.glob(f"*/{JUDGED}"))]
-    tested = [part["group"] for one in documents for part in one["on"]["test"].values()]
-    assert pooled.groups == tuple(sorted(set(tested)))
-    shutil.rmtree(reports)
-
-
 def test_policies_that_were_sampled_otherwise_are_refused(reports, experiments, capsys):
     path = reports / "diffusion-concat" / JUDGED
     document = json.loads(path.read_text())

@@ -130,18 +130,6 @@ def test_the_report_says_what_was_judged_and_which_streams_are_used(judged):
     assert document["on"]["execute"] == 1
 
 
-def test_the_same_judgement_is_the_same_bytes_wherever_it_is_written(
-    trained_tiny, judged, tmp_path
-):
-    output = f"evaluate.output={tmp_path / 'else' / 'where'}"
-    assert run("", evaluate.main, ["--params", str(trained_tiny), "--set", output]) == 0
-    first, second = (
-        {file.name: file.read_bytes() for file in folder.iterdir()}
-        for folder in (judged[0], tmp_path / "else" / "where")
-    )
-    assert first == second and "report.html" in first
-
-
 def test_streams_are_left_alone_where_nobody_asks(trained_tiny, tmp_path, reports):
     """DVC misses no file of such an evaluation either."""
     listed = re.findall(r"evaluate\.output}/([\w.]+)", (ROOT / "dvc.yaml").read_text())

@@ -13,7 +13,6 @@ import pytest
 import yaml
 import zarr
 
-from pipeline.data import lerobot
 from pipeline.simulation.insertion_formats import write_lerobot
 from pipeline.simulation.recorder import simulate_episode
 from pipeline.store import FeatureStore
@@ -148,14 +147,6 @@ def test_a_store_of_recorded_rows_says_their_rate(capsys, params_file, tmp_path)
     assert FeatureStore.open(store).action_hz == 10
 
 
-def test_recorded_rows_without_a_rate(capsys, params_file, tmp_path, monkeypatch):
-    """No format of today lacks it: a clock of one row, by a reader that knows no rate."""
-    monkeypatch.setattr("pipeline.data.timeline._recorded_hz", lambda *_: None)
-    write_small_lerobot(tmp_path / "day1/run")
-    err = refused(capsys, params_file, "data.action_hz=null", "extract.plan=true")
-    assert re.search(r"day1/run.* a single action, which tells no rate.*Set data\.action_hz", err)
-
-
 def test_recordings_without_any_frame(capsys, params_file, tmp_path):
     info = write_small_lerobot(tmp_path / "day1/run") / "meta/info.json"
     features = json.loads(info.read_text())["features"]
@@ -213,19 +204,6 @@ def test_channel_names_of_two_embodiments_are_shown_without_control_characters(
     err = refused(capsys, params_file, f"data.sources={sources}", "extract.plan=true")
     assert "1 channels ['a\\n\\x1b[31m (N)']" in err
     assert "\x1b" not in err
-
-
-def test_a_file_that_is_not_there_is_looked_for_once_for_all_its_episodes(
-    capsys, params_file, tmp_path, monkeypatch
-):
-    root = write_small_lerobot(tmp_path / "day1/run", "v3.0")
-    (root / "data/chunk-000/file-000.parquet").unlink()
-    looked: list[Path] = []
-    monkeypatch.setattr(
-        lerobot, "_refusal", lambda path, ask=lerobot._refusal: [looked.append(path), ask(path)][1]
-    )
-    assert "has none of the 3 episode(s)" in refused(capsys, params_file, "extract.plan=true")
-    assert len(looked) == 1
 
 
 def test_what_to_set_instead_is_named(capsys, params_file, tmp_path):

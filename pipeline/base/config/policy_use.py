@@ -10,9 +10,7 @@ from pipeline.base.config.section import Output, Place, Section, Seed
 
 Level = Literal["depth", "full", "moved"]
 Chunking = Literal["none", "temporal", "rtc"]
-RolloutAblation = Literal[
-    "sensor off", "features off", "state off", "sensor frozen", "features frozen", "state frozen"
-]
+RolloutAblation = Literal["sensor off", "features off", "state off"]
 ExportFormat = Literal["onnx", "torch"]
 PHANTOM: Final = "phantom"
 
@@ -98,9 +96,8 @@ class RolloutParams(Section):
     no time. For several, such as `[0, 300, 600]`, the page plots success against latency;
     everything else uses the first."""
     ablations: tuple[RolloutAblation, ...] = ("sensor off", "features off")
-    """Also run the policy with one stream disturbed. off: every value is its training mean. frozen:
-    the stream stays as it was first, as if it were new. Streams that the policy does not use are
-    skipped, and so is `off` for its only stream. []: none."""
+    """Also run the policy with one stream at its training mean. Streams that the policy does not
+    use, and its only stream, are skipped. []: none."""
     server: str | None = None
     """Address of a running `stages.serve`, such as ws://127.0.0.1:8000; its policy is run over the
     network in place of `checkpoint`. If it needs a token, set the environment variable

@@ -56,12 +56,9 @@ def write_report(folder: Path, report: Report) -> list[Path]:
     All issues of a page are also in `findings.csv` beside it. Pictures are drawn one at a time.
     Each file is put in place whole, the page last, so a kill leaves the old page. Pictures of the
     old page that this one lacks are removed; no other file in `folder` is touched. The caller must
-    have checked that the folder may be written to. Raises `DiskFull` with the old page in place,
-    and `ValueError` if a picture's name is twice in the report or not a plain file stem.
+    have checked that the folder may be written to. Raises `DiskFull` with the old page in place.
     """
     names = [picture.name for picture in report.blocks(Picture)]
-    if len(set(names)) < len(names) or not all(map(_NAME.fullmatch, names)):
-        raise ValueError(f"pictures: expected plain file stems, each once, found {names}")
     temporary = folder / f".{PAGE}.new"
     with disk_full_named(folder):
         folder.mkdir(parents=True, exist_ok=True)

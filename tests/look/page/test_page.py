@@ -120,13 +120,6 @@ def test_a_full_disk_keeps_the_old_page(small_disk: Path) -> None:
     assert [path.name for path in small_disk.iterdir()] == [PAGE]
 
 
-def test_names_of_pictures_are_file_stems_each_once(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="each once"):
-        write_report(tmp_path, pictures("one", "one"))
-    with pytest.raises(ValueError, match="plain file stems"):
-        write_report(tmp_path, pictures("../one"))
-
-
 def test_equal_titles_have_anchors_of_their_own(every_page: Path) -> None:
     page = every_page.read_text()
     assert page.count('<section id="words">') == page.count('<section id="words-2">') == 1

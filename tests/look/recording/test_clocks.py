@@ -54,10 +54,6 @@ def set_by(time: np.ndarray, seconds: float, at: float = 30) -> np.ndarray:
     return time + seconds * (time >= at)
 
 
-def without(time: np.ndarray, start: float, stop: float) -> np.ndarray:
-    return time[(time < start) | (time >= stop)]
-
-
 @pytest.fixture
 def find(healthy: Path, look: Callable[..., EpisodeView]) -> Find:
     """`find({"sensor": time, "view View1": time})`: clock issues of streams with these times."""
@@ -88,13 +84,6 @@ def test_a_clock_that_was_set_is_a_gap_of_that_clock_alone(find: Find) -> None:
     late = {f"view View{place}": set_by(CAMERA + 0.03 * place, 5) for place in (1, 2, 5)}
     found = find({"sensor": FAST, "state": SLOW, **late})
     assert [issue.kind for issue in found] == ["gap"] * 3
-
-
-def test_a_stream_that_lacks_entries_has_a_gap_however_long(find: Find) -> None:
-    (issue,) = find({"sensor": without(FAST, 10, 55), "state": SLOW})
-    assert (issue.kind, issue.stream) == ("gap", "sensor")
-    asleep = {"sensor": set_by(FAST[:9685], 15, at=10), "state": set_by(SLOW[:1510], 15, at=10)}
-    assert {issue.kind for issue in find(asleep)} == {"gap"}, "where all pause none loses ticks"
 
 
 def test_frames_that_are_lost_have_a_place(find: Find) -> None:

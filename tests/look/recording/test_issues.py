@@ -97,21 +97,6 @@ class TestCameras:
         (issue,) = issues_of(folder, views=["View5"])
         assert f"all {len(paths)} frames looked at are one picture" in issue.message
 
-    def test_a_frame_that_cannot_be_decoded(self, copied: Copied, issues_of: Find) -> None:
-        folder = copied("raw")
-        broken = frames(folder, "View5")[33]
-        broken.write_bytes(broken.read_bytes()[:100])
-        (issue,) = issues_of(folder, vlm_reuse_count=1)
-        assert (issue.kind, issue.severity) == ("unreadable", "error")
-        assert broken.name in issue.message
-
-    def test_a_broken_video(self, copied: Copied, issues_of: Find) -> None:
-        root = copied("lerobot")
-        video = sorted(root.rglob("*.mp4"))[0]
-        video.write_bytes(video.read_bytes()[:2000])
-        (issue,) = issues_of(root)
-        assert (issue.kind, issue.severity, issue.stream) == ("unreadable", "error", "view View1")
-
     def test_a_slower_camera_has_fewer_frames(self, copied: Copied, issues_of: Find) -> None:
         folder = copied("raw")
         for path in frames(folder, "View2")[1::2]:

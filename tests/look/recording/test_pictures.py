@@ -14,7 +14,7 @@ from pipeline.base.config import Params
 from pipeline.data import Channels, Stream
 from pipeline.look.page.blocks import Picture, Text
 from pipeline.look.recording.cameras import camera_blocks, draw_views
-from pipeline.look.recording.clocks import Clock, clock_blocks, clock_table, draw_lanes
+from pipeline.look.recording.clocks import Clock, clock_blocks, draw_lanes
 from pipeline.look.recording.episode import EpisodeView
 from pipeline.look.recording.streams import (
     contacts,
@@ -156,13 +156,6 @@ def test_without_ticks_lanes_are_drawn_and_without_streams_nothing(view, draw) -
         assert blocks(empty, draw, PARAMS) == []
 
 
-def test_jitter_is_told_in_milliseconds(view: EpisodeView) -> None:
-    steps = 10.0 + 0.027 * np.tile([1, -1], 50)
-    table = clock_table(view, [Clock("state", "stream", np.cumsum(steps))])
-    place = list(table.columns).index("jitter [ms]")
-    assert table.rows[0][place] == pytest.approx(27, rel=0.02)
-
-
 def test_channels_of_one_unit_share_a_panel_and_profiles_and_grippers_are_apart() -> None:
     names = (*(f"aline_{at:04d}" for at in range(40)), "force", "gripper", "joint_0", "pose_x")
     groups = group_channels(Channels(names, (*[""] * 40, "N", "", "deg", "deg")))
@@ -172,11 +165,6 @@ def test_channels_of_one_unit_share_a_panel_and_profiles_and_grippers_are_apart(
         ("[deg]", 2, ""),
         ("aline", 40, "aline"),
     ]
-
-
-def test_the_same_recording_is_the_same_bytes(view: EpisodeView) -> None:
-    for draw in (draw_sensor, draw_lanes):
-        assert saved(draw(view), "png") == saved(draw(view), "png")
 
 
 def saved(figure: Figure, format: str) -> bytes:

@@ -19,13 +19,11 @@ from pipeline.look.recording.samples import (
     batch_table,
     cut_samples,
     draw_samples,
-    fold_tokens,
     show_prompt,
     window_lengths,
 )
 from pipeline.vlm.feature_spec import FeatureSpec, feature_spec
 from pipeline.vlm.preparation import Preparer
-from pipeline.vlm.processor import TokenKind
 
 Look = Callable[..., EpisodeView]
 WINDOWS = {"horizon": 6, "sensor_window": 40, "state_window": 30}
@@ -176,17 +174,3 @@ class TestPrompt:
             show_prompt(replace(view, instruction=None), vlm, spec)
         with pytest.raises(RecordingError, match="no tick"):
             show_prompt(replace(view, timeline=None), vlm, spec)
-
-
-def test_image_tokens_are_folded_view_by_view() -> None:
-    tokens: list[tuple[str, TokenKind, str | None]] = [
-        *(("<s>", "special", None), ("<e>", "special", None), ("a", "text", None)),
-        *(("b", "text", None), *[("<i>", "image", "View1")] * 3, ("<i>", "image", "View2")),
-    ]
-    assert [(run.text, run.kind, run.note) for run in fold_tokens(tokens)] == [
-        ("<s>", "special", ""),
-        ("<e>", "special", ""),
-        ("ab", "text", ""),
-        ("<i>", "image", "× 3, View1"),
-        ("<i>", "image", "× 1, View2"),
-    ]

@@ -28,14 +28,6 @@ def table_of(view: EpisodeView) -> Table:
     return table
 
 
-@pytest.mark.parametrize("channels", [1, 2, 17])
-def test_statistics_leave_the_values_as_they_are(channels: int) -> None:
-    values = np.random.default_rng(0).normal(size=(50, channels)).astype(np.float32)
-    before = values.copy()
-    assert describe_channels(values, range(channels)).shape == (channels, 7)
-    assert np.array_equal(values, before)
-
-
 def test_statistics_of_every_channel(healthy: Path, look: Look) -> None:
     view = look(healthy / "raw")
     rows = {row[:2]: row[2:] for row in table_of(view).rows}
