@@ -2,6 +2,7 @@
 
   vla-cache NAME --help                    what a command does, its options
   vla-cache NAME --keys                    the keys of params.yaml that it reads
+  source <(vla-cache --completion bash)    completion, for zsh and tcsh too
 
 Each command is also python -m stages.NAME. dvc repro runs the whole pipeline with params.yaml.
 """
@@ -12,7 +13,9 @@ from collections.abc import Sequence
 from importlib import import_module
 from typing import Any
 
-from stages.command import run
+import shtab
+
+from stages.command import parser_of, run
 
 PROGRAM = "vla-cache"
 COMMANDS = {
@@ -35,8 +38,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         shorthands = getattr(stage, "SHORTHANDS", ())
         prog = f"{PROGRAM} {words[0]}"
         return run(stage.__doc__, stage.main, words[1:], shorthands, stage.SECTIONS, prog)
-    _parser().parse_args(words)
-    _parser().print_help()
+    options = _parser().parse_args(words)
+    if options.completion:
+        print(shtab.complete(_with_all_options(), options.completion))
+    else:
+        _parser().print_help()
     return 0
 
 
@@ -53,7 +59,20 @@ def _parser() -> argparse.ArgumentParser:
         description="\n".join(lines),
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
+    parser.add_argument("--completion", choices=shtab.SUPPORTED_SHELLS, help="print the script")
     parser.add_argument("command", nargs="?", choices=_NAMES, metavar="NAME")
+    return parser
+
+
+def _with_all_options() -> argparse.ArgumentParser:
+    """The program with its commands and their options, for completion."""
+    parser = argparse.ArgumentParser(PROGRAM)
+    commands = parser.add_subparsers()
+    for name in _NAMES:
+        stage: Any = import_module(f"stages.{name}")
+        summary = stage.__doc__.split("\n")[0]
+        of_stage = parser_of(summary, getattr(stage, "SHORTHANDS", ()), stage.SECTIONS)
+        commands.add_parser(name, help=summary, parents=[of_stage], add_help=False)
     return parser
 
 

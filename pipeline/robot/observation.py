@@ -1,6 +1,7 @@
 """A robot's observations, checked: a mapping from outside becomes a `RobotObservation`.
 
-Each refusal names the field, what was expected, what was found, and what to mend.
+Each refusal names the field, what was expected, what was found, and what to mend. `KEY_MAPS`
+translates the names that openpi's clients of known robots give to what they send.
 """
 
 from collections.abc import Mapping, Sequence
@@ -12,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.base.arrays import first_non_finite
-from pipeline.base.errors import ObservationError
+from pipeline.base.errors import ConfigError, ObservationError
 from pipeline.base.source import CLOCK_SLACK_S
 from pipeline.robot.loop import PlanGuide
 
@@ -23,6 +24,7 @@ LARGEST_SEED: Final = 2**63
 STREAMS: Final = ("state", "sensor")
 _STILL: Final = 10
 _STILL_S: Final = 2.0
+_HINT: Final = ". For a client with openpi's names of a robot set serve.transform on the server"
 
 
 @dataclass(frozen=True)
@@ -47,15 +49,84 @@ class RobotObservation:
         return float(self.readings["time"][0])
 
 
+@dataclass(frozen=True)
+class KeyMap:
+    """Names of the images, in the order of the policy's views, and of the parts of the state."""
+
+    images: tuple[str, ...]
+    state: tuple[str, ...]
+
+    def refuse_more(self, views: Sequence[str]) -> None:
+        """Raise `ConfigError` for a policy with more views than there are images."""
+        if len(views) > len(self.images):
+            raise ConfigError(
+                f"serve.transform: expected a policy of at most {len(self.images)} views "
+                f"({', '.join(self.images)}), found {', '.join(views)}"
+            )
+
+    def apply(self, given: Mapping[str, Any], views: Sequence[str]) -> dict[str, Any]:
+        """The fields under the policy's names; what is not known keeps its name.
+
+        An image whose name is that of a view stays that view; the others are the views in order,
+        and those beyond the views are left out. An image may have its channels first. Raises
+        `ObservationError` where a part of the state is missing, or is no number.
+        """
+        fields = {name: value for name, value in given.items() if name not in self.images}
+        own = [f"images/{view}" for view in views]
+        named = not {*own}.isdisjoint(self.images)
+        places = {n: n for n in own} if named else dict(zip(self.images, own, strict=False))
+        for name, place in places.items():
+            if name in given:
+                fields[place] = _channels_last(given[name])
+        parts = [name for name in self.state if name in fields]
+        if parts and len(parts) < len(self.state):
+            missing = ", ".join(name for name in self.state if name not in parts)
+            raise ObservationError(f"{missing}: expected it beside {parts[0]}, found none")
+        if parts:
+            try:
+                joined = np.concatenate([np.atleast_1d(fields.pop(name)) for name in parts], -1)
+            except ValueError as error:
+                raise ObservationError(
+                    f"{' + '.join(parts)}: expected numbers of one reading, found {error}"
+                ) from None
+            fields["state"] = joined
+        return fields
+
+
+KEY_MAPS: Mapping[str, KeyMap] = {
+    "aloha": KeyMap(
+        images=(
+            "images/cam_high", "images/cam_left_wrist", "images/cam_right_wrist", "images/cam_low",
+        ),
+        state=("state",),
+    ),
+    "droid": KeyMap(
+        images=("observation/exterior_image_1_left", "observation/wrist_image_left"),
+        state=("observation/joint_position", "observation/gripper_position"),
+    ),
+    "libero": KeyMap(
+        images=("observation/image", "observation/wrist_image"), state=("observation/state",)
+    ),
+}  # fmt: skip
+"""By the names of `serve.transform`; as openpi's examples of these robots have them."""
+
+
+def _channels_last(image: Any) -> Any:
+    first = isinstance(image, np.ndarray) and image.ndim == 3 and image.shape[0] == 3
+    return np.moveaxis(image, 0, -1) if first and image.shape[-1] != 3 else image
+
+
 class ObservationReader:
     """Reads one robot's observations, in order, for the policy of `metadata`.
 
     A refused observation changes nothing.
     """
 
-    def __init__(self, metadata: Mapping[str, Any]) -> None:
+    def __init__(self, metadata: Mapping[str, Any], key_map: KeyMap | None = None) -> None:
+        """`key_map` translates the names of a known robot's client."""
         streams = metadata["streams"]
         self._views: Sequence[str] = streams["views"]
+        self._key_map = key_map
         self._chunk = (metadata["horizon"], metadata["action_dim"])
         widths = {name: len(streams.get(name, {}).get("names", ())) for name in STREAMS}
         self._widths = {name: width for name, width in widths.items() if width}
@@ -70,14 +141,18 @@ class ObservationReader:
         """The observation made of these fields. Raises `ObservationError`.
 
         `time` defaults to the newest time among the fields, else to this machine's clock. A frame
-        or a single reading without a time gets `time`.
+        or a single reading without a time gets `time`. Fields may be nested: `images` with views.
         """
         if not isinstance(given, Mapping):
             raise ObservationError(f"expected fields by name, found {type(given).__name__}")
+        given = _flat(given)
+        if self._key_map is not None:
+            given = self._key_map.apply(given, self._views)
         if unknown := [str(name) for name in given if name not in self._known]:
             known = ", ".join(self._known)
+            hint = "" if self._key_map or "observation/" not in unknown[0] else _HINT
             raise ObservationError(
-                f"{unknown[0]:.80}: expected one of {known}, which this policy takes"
+                f"{unknown[0]:.80}: expected one of {known}, which this policy takes{hint}"
             )
         reset, seed = _reset(given.get("reset", False))
         values = self._values(given)
@@ -202,6 +277,19 @@ class Doubts:
         state = observation.readings.get("state")
         if state is not None and not state.any():
             self.add("state", "state: every channel is exactly 0: is it read from the robot?")
+
+
+def _flat(given: Mapping[Any, Any]) -> dict[Any, Any]:
+    """The fields with those of nested mappings: `{"images": {"a": x}}` as `{"images/a": x}`."""
+    flat: dict[Any, Any] = {}
+    for name, value in given.items():
+        inner = value if isinstance(value, Mapping) and value else {None: value}
+        for key, own in inner.items():
+            place = name if key is None else f"{name}/{key}"
+            if place in flat:
+                raise ObservationError(f"{place:.80}: expected it once, found it twice")
+            flat[place] = own
+    return flat
 
 
 def _numbers(

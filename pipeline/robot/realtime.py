@@ -36,6 +36,7 @@ from pipeline.robot.run_report import (
     RunReport,
     TickPart,
     TickTimer,
+    allowed_ms,
 )
 
 if TYPE_CHECKING:  # It writes images and parquet, which the loop does not need.
@@ -345,9 +346,23 @@ class _Run:
         self.frames_s = max(frames[view][0] for view in self.views)
         return fields
 
+    def _answer_times(self) -> str:
+        """How long answers took, beside how long they may take."""
+        took = self.report.answer_timings.document().get(ANSWER_PARTS[0])
+        if took is None:
+            return ""
+        half_ms = allowed_ms(self.loop.executor.horizon, self.hz)
+        return (
+            f": answers took {took['p50']:.0f} ms (median), {took['max']:.0f} ms at most; half of "
+            f"a chunk is {half_ms:.0f} ms"
+        )
+
     def act(self, observed: Mapping[str, Any]) -> None:
         """Send this tick's action within the limits; nothing before the first chunk."""
-        action = self.loop.action()
+        try:
+            action = self.loop.action()
+        except SafeStop as stop:
+            raise SafeStop(stop.kind, f"{stop}{self._answer_times()}") from None
         if action is not None:
             age_s = self.now_s - self.features_s if self.views else 0.0
             if not age_s <= self.settings.old_features_s:

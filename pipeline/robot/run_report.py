@@ -22,6 +22,11 @@ KEPT = 65536
 PERCENTILES = {"p50": 50.0, "p99": 99.0, "p99.9": 99.9}
 
 
+def allowed_ms(horizon: int, hz: float) -> float:
+    """How long an answer may take: half of a chunk of `horizon` steps at `hz`."""
+    return 500 * horizon / hz
+
+
 class Timings:
     """Milliseconds of parts, a row for each tick or answer; NaN if a part did not happen.
 

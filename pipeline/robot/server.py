@@ -35,14 +35,17 @@ from pipeline.base.config import ServeParams
 from pipeline.base.errors import ConfigError, ObservationError, PipelineError, WireError
 from pipeline.robot import wire
 from pipeline.robot.client import TOKEN_VARIABLE
-from pipeline.robot.run_report import Timings
+from pipeline.robot.observation import KEY_MAPS
+from pipeline.robot.run_report import Timings, allowed_ms
 from pipeline.robot.session import ServedPolicy, Session
 
 CLOSING_S: Final = 30.0
 """How long an unanswered observation may keep the server from closing."""
 _TURNED_AWAY: Final = (401, 403, 503)
 """Statuses of requests that are noted as turned away."""
-Event = Literal["connected", "left", "episode", "warning", "refused", "error", "turned away"]
+Event = Literal[
+    "connected", "left", "episode", "slow", "warning", "refused", "error", "turned away"
+]
 _REFUSALS: Final = ("refused", "error", "turned away")
 _TIMED: Final = ("vlm_ms", "head_ms", "wait_ms", "infer_ms")
 _TIMINGS: Final = 5000
@@ -52,15 +55,22 @@ _SHOWN: Final = 20
 
 
 class ServerStatus:
-    """Counts, latencies and events of a server. Any thread may call it."""
+    """Counts, latencies and events of a server. Any thread may call it.
 
-    def __init__(self, metadata: Mapping[str, Any], say: Callable[[str], None]) -> None:
-        """`say` writes the line of an event."""
+    `say` writes the line of an event, as text or as JSON (`form`).
+    """
+
+    def __init__(
+        self,
+        metadata: Mapping[str, Any],
+        say: Callable[[str], None],
+        form: Literal["text", "json"] = "text",
+    ) -> None:
         self._counts: Counter[Event] = Counter()
         shown = ("checkpoint", "step", "model_type", "action_hz", "feature_spec_digest")
         self._policy = {name: metadata[name] for name in shown}
         self._timings, self._since_s = Timings(_TIMED, _TIMINGS), monotonic()
-        self._lock, self._say = threading.Lock(), say
+        self._lock, self._say, self._form = threading.Lock(), say, form
         self._refusals, self._warnings = (deque[dict[str, str]](maxlen=_SHOWN) for _ in range(2))
 
     @property
@@ -74,10 +84,7 @@ class ServerStatus:
             self._timings.note([timing[part] or math.nan for part in _TIMED])
 
     def note(self, event: Event, robot: str, text: str = "") -> None:
-        """Count an event of the robot at this address, and write its line.
-
-        No line is written of a stranger who is turned away.
-        """
+        """Count an event of the robot at this address, and write its line."""
         text = "".join(c if c.isprintable() else " " for c in text)  # a client forges no line
         time = datetime.now(UTC).isoformat(timespec="milliseconds")
         record = {"time": time, "event": event, "robot": robot, "text": text}
@@ -87,9 +94,9 @@ class ServerStatus:
                 self._refusals.append(record)
             elif event == "warning":
                 self._warnings.append(record)
-        if event != "turned away":
-            with suppress(OSError):  # a log that is full or gone stops no robot
-                self._say(f"{time} {robot} {event}{': ' if text else ''}{text}")
+        line = f"{time} {robot} {event}{': ' if text else ''}{text}"
+        with suppress(OSError):  # a log that is full or gone stops no robot
+            self._say(json.dumps(record) if self._form == "json" else line)
 
     def json(self) -> str:
         """The content of `/status.json`."""
@@ -173,7 +180,12 @@ class PolicyServer:
         self._socket = bound
         host, port = bound.getsockname()[:2]
         self.address = f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
-        self.status = ServerStatus(served.metadata, say)
+        self.status = ServerStatus(served.metadata, say, params.log)
+        self._key_map = None if params.transform is None else KEY_MAPS[params.transform]
+        if self._key_map is not None:
+            self._key_map.refuse_more(served.metadata["streams"]["views"])
+        self._metadata = served.metadata | {"transform": params.transform}
+        self._allowed_ms = allowed_ms(served.metadata["horizon"], served.metadata["action_hz"])
         # One thread a robot, which has at most one unanswered observation.
         self._threads = ThreadPoolExecutor(params.max_connections, "robot")
         self._idle: set[ServerConnection] = set()
@@ -234,8 +246,8 @@ class PolicyServer:
         try:
             # Counted until its last observation is answered, which may be after it has left.
             self.status.note("connected", robot)
-            await connection.send(wire.pack(self._served.metadata))
-            session = self._served.session(self._params.fresh, self._params.seed)
+            await connection.send(wire.pack(self._metadata))
+            session = self._served.session(self._params.fresh, self._params.seed, self._key_map)
             code = None
             while code is None and not self._stopping:
                 message = await self._next(connection)
@@ -300,6 +312,9 @@ class PolicyServer:
         self.status.answered(answer["server_timing"])
         for warning in answer.get("warnings", ()):
             self.status.note("warning", robot, warning)
+        if (spent_ms := answer["server_timing"]["infer_ms"]) > self._allowed_ms:
+            half = f"half of a chunk is {self._allowed_ms:.0f} ms"
+            self.status.note("slow", robot, f"an answer took {spent_ms:.0f} ms, {half}")
         if "feature_key" in answer:
             # Bytes, not an array: openpi's chunk broker indexes every array by step.
             answer["feature_key"] = answer["feature_key"].tobytes()

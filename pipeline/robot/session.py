@@ -22,7 +22,7 @@ from pipeline.policy.policy import Policy
 from pipeline.robot.first_look import FirstLook
 from pipeline.robot.live_features import LiveFeatures, prove
 from pipeline.robot.loop import PlanGuide
-from pipeline.robot.observation import Doubts, ObservationReader, RobotObservation
+from pipeline.robot.observation import Doubts, KeyMap, ObservationReader, RobotObservation
 from pipeline.robot.readings import RobotMemory, SeenFeatures
 
 PROTOCOL = 1
@@ -80,13 +80,16 @@ class ServedPolicy:
             prove(checkpoint, features, say)
         return cls(checkpoint, policy, features, str(folder), FirstLook(checkpoint))
 
-    def session(self, fresh: bool = True, seed: int = 0) -> "Session":
+    def session(
+        self, fresh: bool = True, seed: int = 0, key_map: KeyMap | None = None
+    ) -> "Session":
         """A session of one robot; `seed` seeds the samples that the policy draws for it.
 
         With `fresh` a chunk waits for the features of the frames of its own observation. Without,
-        it takes the newest features, and waits only for the first of an episode.
+        it takes the newest features, and waits only for the first of an episode. `key_map`
+        translates the names of a known robot's client.
         """
-        return Session(self, fresh, seed)
+        return Session(self, fresh, seed, key_map)
 
     def close(self) -> None:
         """Begin no more passes, and wait for the one that runs."""
@@ -156,11 +159,13 @@ class Session:
     One thread at a time may call a session; sessions of one policy may run at once.
     """
 
-    def __init__(self, served: ServedPolicy, fresh: bool, seed: int) -> None:
+    def __init__(
+        self, served: ServedPolicy, fresh: bool, seed: int, key_map: KeyMap | None = None
+    ) -> None:
         self.metadata = served.metadata
         self._served, self._fresh = served, fresh
         self._drawn = torch.Generator().manual_seed(seed)
-        self._reader = ObservationReader(served.metadata)
+        self._reader = ObservationReader(served.metadata, key_map)
         source = served.checkpoint.source
         # Half a tick less, because clocks are not exact.
         self._between_s = (source["vlm_reuse_count"] - 0.5) / source["action_hz"]

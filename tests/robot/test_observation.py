@@ -1,10 +1,12 @@
 """What a robot says is checked; a refusal names the field, what was expected and what was found."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 
-from pipeline.base.errors import ObservationError
-from pipeline.robot.observation import Doubts, ObservationReader
+from pipeline.base.errors import ConfigError, ObservationError
+from pipeline.robot.observation import KEY_MAPS, Doubts, ObservationReader
 from pipeline.simulation.rendering import VIEWS
 
 METADATA = {
@@ -155,3 +157,61 @@ def test_what_cannot_be_true_is_doubted_once(reader, observe) -> None:
         f"images/{view}: the same picture" for view in ("View1", "View2")
     ]
     assert not any(new[1:20]), "two seconds"
+
+
+def test_fields_may_be_nested_and_a_single_reading_has_no_axis(reader) -> None:
+    flat = reader.read({"images/View1": FRAME, "state": STATE[:1], "time": 1.0})
+    nested = reader.read({"images": {"View1": FRAME}, "state": STATE[0].tolist(), "time": 1.0})
+    np.testing.assert_array_equal(nested.frames["View1"], flat.frames["View1"])
+    np.testing.assert_array_equal(nested.readings["state"], flat.readings["state"])
+    with pytest.raises(ObservationError, match=r"^images/View1: expected it once"):
+        reader.read({"images": {"View1": FRAME}, "images/View1": FRAME})
+
+
+OPENPI: dict[str, dict[str, Any]] = {
+    "droid": {
+        "observation/exterior_image_1_left": np.zeros((4, 6, 3), np.uint8),
+        "observation/wrist_image_left": np.full((4, 6, 3), 7, np.uint8),
+        "observation/joint_position": np.arange(7.0),
+        "observation/gripper_position": np.array([7.0]),
+    },
+    "libero": {
+        "observation/image": np.zeros((4, 6, 3), np.uint8),
+        "observation/wrist_image": np.full((4, 6, 3), 7, np.uint8),
+        "observation/state": np.arange(8.0),
+    },
+}
+"""What openpi's examples of these robots send, beside the prompt."""
+
+
+@pytest.mark.parametrize("robot", OPENPI)
+def test_openpis_names_of_a_robot_are_translated(robot: str) -> None:
+    streams = {"views": ["View1", "View2"], "state": {"names": ["j"] * 8}}
+    given = OPENPI[robot] | {"prompt": "do something"}
+    read = ObservationReader(METADATA | {"streams": streams}, KEY_MAPS[robot]).read(given)
+    assert [frame.max() for frame in read.frames.values()] == [0, 7] and read.prompt
+    assert read.readings["state"].tolist() == [[*range(8)]]
+    with pytest.raises(ObservationError, match=r"set serve\.transform"):
+        ObservationReader(METADATA | {"streams": streams}).read(given)
+
+
+def test_what_does_not_fit_a_known_robot_is_refused() -> None:
+    droid, given = KEY_MAPS["droid"], {"observation/joint_position": np.arange(7.0)}
+    with pytest.raises(ObservationError, match=r"^observation/gripper_position: expected it"):
+        droid.apply(given, ["View1"])
+    given |= {"observation/gripper_position": np.zeros((2, 2))}
+    with pytest.raises(ObservationError, match=r"^observation/joint_position .* of one reading"):
+        droid.apply(given, ["View1"])
+    with pytest.raises(ConfigError, match=r"serve\.transform: expected a policy of at most 2"):
+        droid.refuse_more(["View1", "View2", "View3"])
+
+
+def test_a_view_of_an_images_name_stays_that_view() -> None:
+    aloha = KEY_MAPS["aloha"]
+    sent = {name: np.full((4, 6, 3), place) for place, name in enumerate(aloha.images)}
+    views = ["cam_high", "cam_left_wrist", "cam_low", "cam_right_wrist"]
+    for known in (views, views[1:3]):
+        taken = aloha.apply(sent, known)
+        assert taken.keys() == {f"images/{view}" for view in known}
+        assert all(taken[name] is sent[name] or (taken[name] == sent[name]).all() for name in taken)
+    assert [image[0, 0, 0] for image in aloha.apply(sent, ["View1", "View2"]).values()] == [0, 1]

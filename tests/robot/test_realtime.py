@@ -282,6 +282,7 @@ def test_a_plan_that_is_used_up_stops_the_robot() -> None:
     arm, brain = Arm(), Brain(answers)
     report = stopped(arm, StopKind.NO_CHUNK, "used up", brain)
     assert len(arm.acts) == HORIZON + 1 and report.answers == 2
+    assert "ms at most; half of a chunk is 100 ms" in report.reason
 
 
 def of_question(number: int, value: float) -> Callable[[int, Observed], None]:

@@ -71,7 +71,7 @@ def test_a_connection_is_one_memory_and_bit_for_bit_what_a_session_in_process_is
     served = served_policy("flow_matching")
     server, here = serving(served, seed=3), served.session(seed=3)
     with client_of(server) as client, client_of(server) as other:
-        assert client.metadata == served.metadata
+        assert client.metadata == served.metadata | {"transform": None}
         alone = [here.infer(observe(tick)) for tick in range(5)]
         for tick, own in enumerate(alone):
             there = client.infer(observe(tick))
@@ -136,7 +136,7 @@ def test_what_is_wrong_with_a_message_costs_its_connection_only(
 
 
 def test_status_and_lines_say_what_happened(served_policy, serving, observe):
-    server: Any = serving(served_policy())
+    server: Any = serving(served_policy(), log="json")
     with client_of(server) as client:
         client.reset()
         client.infer(observe(0, prompt="go\non"))
@@ -158,10 +158,23 @@ def test_status_and_lines_say_what_happened(served_policy, serving, observe):
         ("refused", "gripper"), ("turned away", "web pages are not served"),
     ]  # fmt: skip
     assert [w["text"].split(":")[0] for w in shown["warnings"]] == ["prompt", "state"]
-    events = [line.split()[2].strip(":") for line in server.lines[:5]]
-    assert events == ["connected", "episode", "warning", "warning", "left"]
-    assert server.lines[1].endswith("episode: go on") and "2 answers in " in server.lines[4]
-    assert not any("turned away" in line for line in server.lines)
+    lines = [json.loads(line) for line in server.lines]
+    events = [line["event"] for line in lines]
+    assert events[:5] == ["connected", "episode", "warning", "warning", "left"]
+    assert lines[1]["text"] == "go on" and lines[4]["text"].startswith("2 answers in ")
+    assert {"refused", "turned away"} <= set(events)
+
+
+def test_a_client_of_a_known_robot_is_answered(served_policy, serving, observe) -> None:
+    served = served_policy()
+    own = observe(0, state=np.arange(12.0), state_time=None, sensor=None, sensor_time=None)
+    cameras = ("cam_high", "cam_left_wrist", "cam_right_wrist")
+    views = [name for name in own if name.startswith("images/")]
+    images = {c: np.moveaxis(own[v], -1, 0) for c, v in zip(cameras, views, strict=True)}
+    with client_of(serving(served, transform="aloha")) as client:
+        assert client.metadata["transform"] == "aloha"
+        answer = client.infer({"images": images, "state": own["state"], "time": own["time"]})
+    np.testing.assert_array_equal(answer["actions"], served.session().infer(own)["actions"])
 
 
 def test_a_message_beyond_the_bound_is_not_read(served_policy, serving, observe) -> None:

@@ -220,7 +220,11 @@ def test_a_stage_is_a_module_and_a_subcommand_with_the_same_options(stage, monke
     assert prog == f"vla-cache {stage}"
 
 
-def test_all_commands_are_listed(capsys):
+def test_all_commands_are_listed_and_completed(capsys):
     assert stages.__main__.main([]) == 0
     listed = capsys.readouterr().out
     assert sorted(re.findall(r"^  (\w+) +[A-Z]", listed, re.MULTILINE)) == STAGES
+    assert stages.__main__.main(["--completion", "bash"]) == 0
+    script = capsys.readouterr().out
+    assert f"subparsers=({' '.join(sum(stages.__main__.COMMANDS.values(), ()))})" in script
+    assert "verify_option_strings=(-h --help --params --set --keys --reextract" in script

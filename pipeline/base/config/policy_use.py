@@ -133,6 +133,14 @@ class ServeParams(Section):
     """Largest size of one observation, in MiB."""
     idle_s: float = Field(default=600.0, gt=0, le=1e6)
     """Seconds after which a connection without a complete message is closed."""
+    transform: Literal["aloha", "droid", "libero"] | None = None
+    """Take observations by the names that openpi's clients of this robot give. Their images are
+    the policy's views in this order. aloha: `images/cam_high`, `cam_left_wrist`,
+    `cam_right_wrist`, `cam_low`; `state`. droid: `observation/exterior_image_1_left`,
+    `wrist_image_left`; the state is `joint_position` and `gripper_position`. libero:
+    `observation/image`, `wrist_image`; `observation/state`."""
+    log: Literal["text", "json"] = "text"
+    """How the line of each connection, episode, slow answer, warning and refusal is written."""
 
 
 class DriveParams(Section):
