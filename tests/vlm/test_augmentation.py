@@ -153,14 +153,3 @@ class TestPreparer:
                 assert (rows[a].pixels[view] != rows[b].pixels[view]).mean() > 0.5
         (only,) = extractor().preparer.prepare_variants("go", frames, KEY)
         assert np.array_equal(only.pixels, plain.pixels)
-
-    def test_cameras_are_drawn_apart_and_a_missing_one_is_missing_in_all(
-        self, extractor, make_frame
-    ):
-        ours = extractor(variants=2)
-        twins = {"View1": make_frame(0), "View2": make_frame(0)}
-        _, changed = ours.preparer.prepare_variants("go", twins, KEY)
-        assert not np.array_equal(changed.pixels[0], changed.pixels[1])
-        _, alone = ours.preparer.prepare_variants("go", {"View2": make_frame(0)}, KEY)
-        assert [view for view, _ in alone.layout.image_starts] == ["View2"]
-        assert np.array_equal(alone.pixels[0], changed.pixels[1])
