@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
-from PIL import Image
+from PIL import Image, ImageEnhance
 
 from pipeline.base.config import AugmentationParams
 from pipeline.vlm.augmentation import Augmentation
@@ -118,6 +118,17 @@ def test_a_stretched_frame_turns_as_the_camera_saw_it(make_frame):
     found, expected = turned.apply(wide(frame), widened=2.5), wide(turned.apply(frame))
     assert np.abs(found.astype(int) - expected).mean() < 2
     assert np.abs(turned.apply(wide(frame)).astype(int) - expected).mean() > 10
+
+
+@pytest.mark.parametrize(
+    ("name", "factor"), [("brightness", 0.7), ("contrast", 1.3), ("saturation", 0.7)]
+)
+def test_light_is_pillows_enhancement(make_frame, name, factor):
+    frame = (make_frame(3) * 0.6 + 40).astype(np.uint8)  # clear of both ends of the range
+    enhancer = {"saturation": "Color"}.get(name, name.capitalize())
+    expected = getattr(ImageEnhance, enhancer)(Image.fromarray(frame)).enhance(factor)
+    found = replace(PLAIN, **{name: factor}).apply(frame)
+    assert np.abs(found.astype(int) - np.asarray(expected)).max() <= 2
 
 
 @given(
