@@ -90,10 +90,9 @@ class PickledRecording(InsertionRecording):
     def __init__(self, path: Path, source: Source, views: Sequence[str] | None) -> None:
         super().__init__(path, source, views)
         self._pickle = path / MARKER
-        self._kept: _Content | None = None
 
     def action(self) -> RecordedAction:
-        content = self._content()
+        content = self._content
         values = self._rows(content.action, "action", len(ACTION.names))
         rate_hz = content.metadata.action_hz or _ACTION_HZ
         time = self._start + np.arange(len(values)) / rate_hz
@@ -120,19 +119,17 @@ class PickledRecording(InsertionRecording):
         path = robot_state_file(self.path)
         if path is None:
             return None
-        rate_hz = self._content().metadata.robot_hz or _ROBOT_HZ
+        rate_hz = self._content.metadata.robot_hz or _ROBOT_HZ
         return read_robot_states(path, self._overrides.limits, self._start, rate_hz)
 
+    @cached_property
     def _content(self) -> _Content:
-        """The pickle's content, possibly without the sensor's readings."""
-        return self._kept or self._read()
+        """What is kept: all but the sensor's readings, as thousands of episodes stay open."""
+        return self._read().model_copy(update={"sensor_data": None})
 
     def _read(self) -> _Content:
-        # Thousands of episodes stay open, so the large sensor readings are not kept.
         loaded = load_plain(self._pickle, self._overrides.limits.array_bytes)
-        content = RECORDINGS.parse(loaded, _Content, self._pickle)
-        self._kept = content.model_copy(update={"sensor_data": None})
-        return content
+        return RECORDINGS.parse(loaded, _Content, self._pickle)
 
     def _rows(self, array: Numbers, key: str, width: int) -> Numbers:
         where = f"{self._pickle}, {key!r}"
@@ -152,7 +149,7 @@ class PickledRecording(InsertionRecording):
         return self._rows(sensor, "sensor_data", len(SENSOR.names)), where
 
     def _recorded_instruction(self) -> str:
-        return self._content().instruction or super()._recorded_instruction()
+        return self._content.instruction or super()._recorded_instruction()
 
     @cached_property
     def _start(self) -> float:
@@ -162,7 +159,7 @@ class PickledRecording(InsertionRecording):
     @cached_property
     def _recorded(self) -> Mapping[str, list[str]]:
         """Recorded paths by view name; a view with an empty list was never captured."""
-        recorded = self._content().image or {}
+        recorded = self._content.image or {}
         return name_views({split_eye(view): paths for view, paths in recorded.items() if paths})
 
     def _locate(self, recorded: str, where: str) -> Path:

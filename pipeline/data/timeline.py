@@ -89,7 +89,9 @@ def build_timeline(
     recorded = recording.action()
     poses = recording.poses()
     rate: float | None = None
-    if recorded is not None and not _redo_rotation(recorded, poses, action_rotation):
+    # As rotation vectors, recorded Euler deltas are derived again from poses.
+    euler = recorded is not None and recorded.channels == pose_channels("euler_delta")
+    if recorded is not None and not (poses and euler and action_rotation == "rotvec"):
         clocks["action"] = recorded.time
         rate = _recorded_hz(recording, recorded)
         time, action = _recorded_ticks(recording, recorded, rate, clocks, action_hz)
@@ -188,17 +190,6 @@ def tick_hz(recorded_hz: Iterable[float | None], action_hz: float | None) -> flo
 def wrapped_deg(angle: NDArray[np.float64]) -> NDArray[np.float64]:
     """The same angles in [-180, 180)."""
     return (angle + 180.0) % 360.0 - 180.0
-
-
-def _redo_rotation(
-    recorded: RecordedAction, poses: Stream | None, action_rotation: ActionRotation
-) -> bool:
-    """Whether recorded Euler deltas must be derived again from poses, as rotation vectors."""
-    return (
-        action_rotation == "rotvec"
-        and poses is not None
-        and recorded.channels == pose_channels("euler_delta")
-    )
 
 
 def pose_channels(action_rotation: ActionRotation) -> Channels:

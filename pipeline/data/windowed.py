@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from pipeline.base.arrays import first_non_finite
 from pipeline.base.border import Text
 from pipeline.base.config import Source
 from pipeline.base.errors import RecordingError
@@ -86,7 +85,7 @@ class WindowedRecording(InsertionRecording):
     def state(self) -> Stream | None:
         path, metadata = robot_state_file(self.path), self._metadata
         if path is None:
-            return self._absent("robot_states_count", self.path / "robot_states.npz")
+            return self._check_count("robot_states_count", 0, self.path / "robot_states.npz")
         times = (metadata.start_time, metadata.robot_hz, metadata.end_time)
         stream = read_robot_states(path, self._overrides.limits, *times)
         self._check_count("robot_states_count", len(stream.time), path)
@@ -95,7 +94,7 @@ class WindowedRecording(InsertionRecording):
     def sensor(self) -> Stream | None:
         path = self.path / _SENSOR_FILE
         if not os.path.lexists(path):
-            return self._absent("sensor_windows_count", path)
+            return self._check_count("sensor_windows_count", 0, path)
         members = read_npz(path, ("timestamps", "data"), limits=self._overrides.limits)
         stored = member(members, ("timestamps",), path)
         ends = stored.astype(np.float64)
@@ -120,10 +119,6 @@ class WindowedRecording(InsertionRecording):
 
     def _recorded_instruction(self) -> str:
         return self._metadata.instruction or super()._recorded_instruction()
-
-    def _absent(self, key: str, path: Path) -> None:
-        """Refuse an absent file of which the metadata count rows."""
-        self._check_count(key, 0, path)
 
     def _check_count(self, key: str, rows: int, path: Path) -> None:
         count = getattr(self._metadata, key)
@@ -156,9 +151,8 @@ def rebuild(
     `ends` (window,) s never decreases; `windows` is (window, reading, channel). Readings are spread
     evenly between the ends of windows that overlap or abut; after a gap, and in the first window,
     they are dated back from the end at `sensor_hz`. Raises `RecordingError` where windows overlap
-    by the clock but their readings differ, and on NaN or inf.
+    by the clock but their readings differ, as those with NaN do.
     """
-    _check_finite(windows, where)
     width = windows.shape[1]
     fresh = np.array([width, *_strides(ends, windows, sensor_hz, where)])
     usual = np.median(fresh[1:]) if len(ends) > 1 else width
@@ -211,14 +205,6 @@ def _strides(
             )
         strides.append(stride)
     return strides
-
-
-def _check_finite(windows: Numbers, where: str) -> None:
-    for index, window in enumerate(windows):
-        if (bad := first_non_finite(window)) is not None:
-            raise RecordingError(
-                f"{where}: {window[bad]} in window {index}, reading {bad[0]}, channel {bad[1]}"
-            )
 
 
 def _proved_stride(windows: Numbers) -> int | None:

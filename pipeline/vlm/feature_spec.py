@@ -125,7 +125,8 @@ def feature_shape(vlm: VLMParams, views: Sequence[str]) -> tuple[int, int]:
     Raises `VLMError` for a checkpoint that is neither a folder nor a hub id, also for a name whose
     parent is a folder here but that does not exist.
     """
-    folder, tokens = folder_here(vlm.checkpoint), _tokens_of_3b(vlm)
+    folder = folder_here(vlm.checkpoint)
+    tokens = round(vlm.image_resize_height / 28), round(vlm.image_resize_width / 28)  # of the 3B
     if folder and "tokens" in vlm.pooling:
         from pipeline.vlm.processor import PixelSettings
 
@@ -139,12 +140,6 @@ def feature_shape(vlm: VLMParams, views: Sequence[str]) -> tuple[int, int]:
             f"`{command('demo')}`."
         )
     return slots, _WIDTH_OF_3B
-
-
-def _tokens_of_3b(vlm: VLMParams) -> tuple[int, int]:
-    """Rows and columns of a view's image tokens in Qwen2.5-VL-3B; each shows 28 x 28 pixels."""
-    height, width = vlm.image_resize_height, vlm.image_resize_width
-    return round(height / 28), round(width / 28)
 
 
 def _read(folder: Path, vlm: VLMParams, views: int) -> dict[str, Any]:

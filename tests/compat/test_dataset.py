@@ -235,6 +235,15 @@ class TestErrors:
         with pytest.raises(StoreIncomplete, match=r"nowhere\.zarr"):
             UnifiedVLADataset(store=tmp_path / "nowhere.zarr")
 
+    def test_every_broken_episode_is_named(self, copied) -> None:
+        folder = copied("new")
+        for metadata in folder.glob("**/metadata.json"):
+            metadata.write_text("{")
+        with pytest.raises(
+            RecordingError, match=r"(?s)2 episodes.*_092140/metadata.*_092320/metadata"
+        ):
+            UnifiedVLADataset(folder)
+
 
 class TestSplit:
     def test_whole_episodes_on_either_side_and_the_store_stays(self, cached):

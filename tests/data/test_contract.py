@@ -13,16 +13,10 @@ from pipeline.data import Recording, open_recordings
 FORMATS = {
     "raw": lambda write, folder, truth: write.raw(folder / "Blue_point/data_collection_1", truth),
     "new": lambda write, folder, truth: write.new(folder / "Blue_point/episode_1", truth),
-    "new, overlapping": lambda write, folder, truth: write.new(folder / "T/e", truth, 65, 13),
     "old": lambda write, folder, truth: write.old(folder / "White_circle/recv_all_1", truth),
-    "lerobot v2.0": lambda write, folder, truth: write.lerobot(folder / "set", "v2.0"),
     "lerobot v2.1": lambda write, folder, truth: write.lerobot(folder / "set", "v2.1"),
-    "lerobot v3.0": lambda write, folder, truth: write.lerobot(folder / "set", "v3.0"),
     "lerobot v3.0, two files": lambda write, folder, truth: write.lerobot(
         folder / "set", "v3.0", file_of=[0, 0, 1]
-    ),
-    "lerobot v2.1, images": lambda write, folder, truth: write.lerobot(
-        folder / "set", "v2.1", image=True
     ),
     "lerobot v3.0, images": lambda write, folder, truth: write.lerobot(
         folder / "set", "v3.0", image=True

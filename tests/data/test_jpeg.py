@@ -108,6 +108,12 @@ def test_pixels_of_a_png_are_shown_in_eight_bits(tmp_path, mode):
     assert pixels.any()
 
 
+def test_colours_keep_their_order(tmp_path):
+    pixels = np.full((4, 6, 3), (200, 30, 10), np.uint8)
+    Image.fromarray(pixels).save(path := tmp_path / "1.0.png")
+    assert np.array_equal(read_image(path, str(path)), pixels)
+
+
 def saved(format: str, kind: str = "RGB") -> bytes:
     buffer = io.BytesIO()
     noise = np.random.default_rng(0).integers(0, 255, (30, 40, 3), np.uint8)

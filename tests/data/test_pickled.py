@@ -54,6 +54,12 @@ def test_frames_recorded_elsewhere_are_found_under_the_folder(old, truth):
     assert len(cameras["View1"].time) != len(recording.action().time)  # is no error
 
 
+def test_no_image_is_t0_of_zero(old):
+    recording = old(eyes=(), image={})
+    expect(recording.action().time, 0.0, 10)
+    assert recording.cameras() == {}
+
+
 def test_two_eyes_are_two_views_and_t0_ignores_the_filter(old, write, only):
     recording = old(eyes=("left", "right"))
     assert list(recording.cameras()) == ["View1_left", "View1_right"]

@@ -128,6 +128,12 @@ class TestRecordedTicks:
         with pytest.raises(RecordingError, match=r"made.*10 Hz.*action_hz=25"):
             build_timeline(Made(recorded=recorded_at(np.arange(20) / 10)), 25.0, 3, "euler_delta")
 
+    def test_take_the_rate_from_the_clock_where_none_is_named(self):
+        recorded = recorded_at(np.arange(20) / 20, rate=None)
+        assert len(build_timeline(Made(recorded=recorded), 20.0, 3, "euler_delta").time) == 20
+        with pytest.raises(RecordingError, match="20 Hz"):
+            build_timeline(Made(recorded=recorded), 10.0, 3, "euler_delta")
+
 
 def regular(offset_s: float, rate_hz: float, entries: int, dtype: str) -> NDArray[np.float64]:
     """A clock of equal steps as a recorder of that type stores it."""
@@ -182,15 +188,6 @@ class TestRegularRecordings:
 
 
 class TestCoverage:
-    def test_begins_when_the_last_stream_begins_and_ends_when_the_first_ends(self):
-        made = Made(
-            camera_times={"View1": np.arange(0.35, 9, 0.2), "View2": np.arange(0, 2.05, 0.2)},
-            recorded=recorded_at(np.arange(100) / 10),
-        )
-        line = build_timeline(made, 10.0, 3, "euler_delta")
-        assert line.time[0] == pytest.approx(0.4)
-        assert line.time[-1] == pytest.approx(2.0)
-
     def test_counts_sensor_and_state(self):
         time = np.arange(100) / 10
         sensor = Stream(JOINTS, 0.55 + np.arange(50) / 50, np.zeros((50, 2), np.float32))

@@ -3,7 +3,6 @@
 from typing import Any
 
 import torch
-from safetensors import safe_open
 from transformers import AutoTokenizer
 
 from pipeline.vlm.demo_checkpoint import write_demo_checkpoint
@@ -23,22 +22,6 @@ def test_same_seed_same_bytes(demo_checkpoint, tmp_path):
     assert changed == {"model.safetensors"}
     assert [path.name for path in tmp_path.iterdir()] == ["again"]
     assert torch.equal(torch.random.get_rng_state(), before)
-
-
-def test_it_has_the_hubs_layout_and_a_few_million_parameters(demo_checkpoint):
-    assert {path.name for path in demo_checkpoint.iterdir()} == {
-        "config.json",
-        "generation_config.json",
-        "model.safetensors",
-        "preprocessor_config.json",
-        "tokenizer.json",
-        "tokenizer_config.json",
-    }
-    with safe_open(demo_checkpoint / "model.safetensors", "pt") as weights:
-        names = list(weights.keys())
-        parameters = sum(weights.get_tensor(name).numel() for name in names)
-    assert {"visual.patch_embed.proj.weight", "model.layers.0.self_attn.q_proj.bias"} <= set(names)
-    assert 1e6 < parameters < 1e7
 
 
 def test_the_tokenizer_has_merges_and_keeps_any_text(demo_checkpoint):

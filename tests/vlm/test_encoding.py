@@ -156,35 +156,6 @@ def test_tokens_and_the_vision_tower_are_those_of_plain_transformers(
     assert len(alone.model._model.language_model.layers) == 0  # the language model does not run
 
 
-def test_bfloat16_rows_agree_within_its_noise(extractor, rows):
-    full = extractor(pooling=["mean", "view_mean", "last"])
-    half = extractor(
-        "bfloat16", dtype="bfloat16", pooling=["mean", "view_mean", "last"], attention="eager"
-    )
-    prepared = [half.preparer.prepare(*row) for row in rows]
-    batch, valid = half.model.encode(prepared)
-    assert batch.dtype == torch.bfloat16
-    alone = torch.cat([half.model.encode([row])[0] for row in prepared])
-    exact, _ = full.model.encode(prepared)
-    for other in (alone.float(), exact):
-        error = (batch.float() - other).norm(dim=-1) / other.norm(dim=-1).clamp(min=1e-6)
-        assert error[valid].max() < 0.06
-        assert error[valid].mean() < 0.03
-    assert half.model.environment["attention"] == "eager"
-
-
-def test_only_needed_layers_are_kept(extractor, rows):
-    whole = extractor(layers=[-1, 1])
-    cut = extractor(layers=[1])
-    assert len(cut.model._model.language_model.layers) == 2
-    prepared = [whole.preparer.prepare(*row) for row in rows]
-    torch.testing.assert_close(
-        cut.model.encode(prepared)[0], whole.model.encode(prepared)[0][:, 1:]
-    )
-    assert not any(parameter.requires_grad for parameter in cut.model._model.parameters())
-    assert not hasattr(cut.model._model, "lm_head")
-
-
 def test_one_store_may_hold_no_view_at_all(extractor):
     blind = extractor(views=(), pooling=["mean", "image_mean"])
     row = blind.preparer.prepare("insert the needle", {})
