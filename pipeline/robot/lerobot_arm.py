@@ -10,7 +10,6 @@ Cameras take images on threads of their own, so an image is older, by up to its 
 `camera_latency_s`, or frames and features seem that much younger than they are.
 """
 
-import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NoReturn
@@ -21,8 +20,6 @@ from numpy.typing import NDArray
 from pipeline.base.errors import CheckpointMismatch
 
 _DELTA, _PLACE = "delta_", ".pos"
-_PORT_S = 0.2
-"""How long a stop waits for another call that holds the robot's port."""
 
 
 class LeRobotArm:
@@ -42,7 +39,6 @@ class LeRobotArm:
         motors: Mapping[str, str] | None = None,
         clock_s: Callable[[], float] = time.monotonic,
         camera_latency_s: float = 0.0,
-        say: Callable[[str], object] = print,
     ) -> None:
         """`metadata` is the policy's; `cameras` are by view, `motors` by channel.
 
@@ -51,9 +47,8 @@ class LeRobotArm:
         moves by deltas; where `cameras` or `motors` name something that the policy does not have;
         and for actions that are neither absolute nor deltas.
         """
-        self._robot, self._clock_s, self._say = robot, clock_s, say
+        self._robot, self._clock_s = robot, clock_s
         self._camera_latency_s = camera_latency_s
-        self._port = threading.Lock()
         streams, seen, moved = (
             metadata["streams"],
             robot.observation_features,
@@ -82,8 +77,7 @@ class LeRobotArm:
     def observe(self) -> dict[str, NDArray[Any]]:
         """Observe once a tick: `state` (1, dim), `state_time` (1,) and `time` (1,), s."""
         self._time_s = self._clock_s()
-        with self._port:
-            self._seen = self._robot.get_observation()
+        self._seen = self._robot.get_observation()
         observed = {"time": np.array([self._clock_s()])}
         if self._state:
             state = [float(self._seen[key]) for key in self._state]
@@ -106,25 +100,16 @@ class LeRobotArm:
         for key, moving in zip(self._action, self._moving, strict=True):
             if moving:
                 goal[key] += self._sent.get(key, float(self._seen[key]))
-        with self._port:
-            self._send(goal)
+        self._send(goal)
 
     def stop(self, reason: str) -> None:
         """Hold the position of the newest observation; observing again might block.
 
-        It may be called from any thread. If another call holds the port, the stop is sent all the
-        same, with a warning.
+        It may be called from any thread. If another call has the robot's port, LeRobot refuses this
+        one; the loop stops the robot again when that call has returned.
         """
-        free = self._port.acquire(timeout=_PORT_S)
-        try:
-            if goal := {key: float(self._seen[key]) for key in self._action if key in self._seen}:
-                self._send(goal)
-        finally:
-            if free:
-                self._port.release()
-            else:
-                sent = f"LeRobotArm: stop ({reason}) was sent while another call kept the port for"
-                self._say(f"{sent} {_PORT_S:g} s: see that the robot stands still")
+        if goal := {key: float(self._seen[key]) for key in self._action if key in self._seen}:
+            self._send(goal)
 
     def _send(self, goal: dict[str, float]) -> None:
         sent = self._robot.send_action(dict(goal))

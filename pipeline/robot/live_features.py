@@ -48,13 +48,9 @@ class LiveFeatures:
         self._preparer = Preparer(vlm, self.spec)
         self._trained = trained
 
-    def prompt(self, instruction: str, views: Sequence[str]) -> str:
-        """The rendered prompt that goes with frames of these views."""
-        return self._preparer.render(instruction, views)
-
     def key(self, frames: Mapping[str, NDArray[np.uint8]], instruction: str) -> bytes:
         """The key (16 bytes) of these frames in the store that the policy was trained on."""
-        prompt = self.prompt(instruction, list(frames))
+        prompt = self._preparer.render(instruction, list(frames))
         return row_key(self._trained["digest"], self._trained["views"], prompt, frames)
 
     @torch.inference_mode()

@@ -151,7 +151,9 @@ def run_robot(
             report.traceback += stop_firmly(robot.stop, report.reason) + run.close()
     if recorder is not None:
         try:
-            report.recording = recorder.finish(report.reason, report.timings())
+            timings = {"tick_ms": report.tick_timings, "answer_ms": report.answer_timings}
+            told = {name: own.document() for name, own in timings.items()}
+            report.recording = recorder.finish(report.reason, told)
         except Exception as error:  # The report still says why the robot stands still.
             report.traceback += f"no recording: {type(error).__name__}: {error}"
     return report

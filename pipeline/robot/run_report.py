@@ -111,8 +111,3 @@ class RunReport:
     def answers(self) -> int:
         """Answers of the policy."""
         return self.answer_timings.count
-
-    def timings(self) -> dict[str, Any]:
-        """The timings as a recording keeps them."""
-        tick, answer = self.tick_timings, self.answer_timings
-        return {"tick_ms": tick.document(), "answer_ms": answer.document()}

@@ -1,6 +1,5 @@
 """A robot shaped like LeRobot's is driven by the policy's channels, and refused where it is not."""
 
-import threading
 from collections.abc import Mapping
 from typing import Any
 
@@ -106,47 +105,6 @@ def test_stop_holds_where_the_robot_was_last_seen_without_asking_and_deltas_begi
     assert (robot.sent[-1], robot.asked) == (robot.place, 1)
     arm.act(np.zeros(3))
     assert robot.sent[-1] == robot.place
-
-
-class Blocked(Follower):
-    """Its first command waits on the bus until `go`."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.begun, self.go = threading.Event(), threading.Event()
-        self.log: list[str] = []
-
-    def send_action(self, action: dict[str, Any]) -> dict[str, Any]:
-        first = not self.log
-        self.log.append("begin")
-        if first:
-            self.begun.set()
-            self.go.wait(60)
-        self.log.append("end")
-        return super().send_action(action)
-
-
-@pytest.mark.parametrize("hangs", [False, True])
-def test_stop_waits_for_a_command_under_way_but_not_for_one_that_hangs(hangs, monkeypatch):
-    monkeypatch.setattr("pipeline.robot.lerobot_arm._PORT_S", 0.05 if hangs else 60.0)
-    robot, said = Blocked(), list[str]()
-    arm = LeRobotArm(robot, metadata_of(), {"View1": "front"}, say=said.append)
-    arm.observe()
-    acting = threading.Thread(target=arm.act, args=(np.ones(3),))
-    acting.start()
-    assert robot.begun.wait(60)
-    stopping = threading.Thread(target=arm.stop, args=("no tick has ended",))
-    stopping.start()
-    if hangs:
-        stopping.join(60)
-        assert robot.sent == [robot.place]
-        assert len(said) == 1 and "(no tick has ended) was sent while another call" in said[0]
-    robot.go.set()
-    acting.join(60)
-    stopping.join(60)
-    if not hangs:
-        assert robot.log == ["begin", "end"] * 2
-        assert (robot.sent[-1], said) == (robot.place, [])
 
 
 def test_names_that_differ_are_mapped() -> None:

@@ -88,6 +88,14 @@ class TestSteps:
         executor.plan(np.ones((HORIZON, 2)))
         assert play(executor, 2) == [1, 1]
 
+    def test_a_chunk_is_copied(self, chunking: Chunking) -> None:
+        executor, buffer = Executor(chunking, 2, HORIZON), chunk_of(0)
+        take(executor, buffer)
+        buffer[:] = -1
+        action = executor.next_action()
+        action[:] = -1
+        assert play(executor, 2) == [1, 2] and action.dtype == np.float32
+
     @given(st.lists(st.tuples(st.booleans(), st.integers(0, 3)), max_size=30))
     def test_whatever_the_delays_every_step_is_that_of_its_tick(self, chunking, turns):
         """Others drop as many steps as the computation is believed to have taken."""
@@ -225,6 +233,7 @@ class TestGuide:
         falling = [x * (np.e**x - 1) / (np.e - 1) for x in c]
         expected = [1, 1, *falling, 0, 0, 0]
         np.testing.assert_allclose(soft_mask(10, 2, 7), expected, rtol=1e-6)
+        assert soft_mask(10, 9, 4).tolist() == [1] * 4 + [0] * 6, "no more than the overlap"
 
     def test_robots_without_a_plan_weigh_nothing_in_a_batch(self) -> None:
         plan = PlanGuide(np.full((4, 2), 3, np.float32), np.full(4, 0.5, np.float32))
