@@ -53,14 +53,6 @@ def test_a_sound_store_has_nothing_to_repair(verified, store, capsys):
     assert not part_path(store).exists()
 
 
-def test_an_address_where_no_scheduler_answers(verified, capsys, monkeypatch):
-    monkeypatch.setattr("pipeline.base.scheduler.TIMEOUT_S", 0.5)
-    for address in ("nonsense://here", "tcp://127.0.0.1:9"):
-        assert verified("--set", f"verify.workers={address}") == 2
-        err = capsys.readouterr().err
-        assert f"verify.workers: no dask scheduler answers at {address}" in err
-
-
 def test_a_damaged_store_says_what_is_wrong_and_what_to_run_next(verified, store, capsys):
     damage(store)
     assert verified() == 2
