@@ -128,7 +128,7 @@ def draw_gains(study: ProbeStudy) -> Figure:
     return figure
 
 
-def _draw_map(axis: Axes, grid: NDArray[np.float64], limits: tuple[float, float]) -> AxesImage:
+def _draw_map(axis: Axes, grid: NDArray[Any], limits: tuple[float, float]) -> AxesImage:
     """The (row, column) values as coloured cells with their numbers; NaN is empty."""
     low, high = limits
     axis.grid(visible=False)
@@ -137,12 +137,9 @@ def _draw_map(axis: Axes, grid: NDArray[np.float64], limits: tuple[float, float]
     for (row, column), value in np.ndenumerate(grid):
         if np.isfinite(value):
             light = np.dot(image.to_rgba(value)[:3], (0.3, 0.6, 0.1)) > 0.5
-            style: dict[str, Any] = {
-                "ha": "center",
-                "va": "center",
-                "color": "#111111" if light else "#ffffff",
-            }
-            axis.text(column, row, f"{value:z.{decimals}f}", size=8, **style)
+            ink = "#111111" if light else "#ffffff"
+            words = f"{value:z.{decimals}f}"
+            axis.text(column, row, words, ha="center", va="center", color=ink, size=8)
     return image
 
 
