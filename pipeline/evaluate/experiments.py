@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain, pairwise
 from pathlib import Path
-from typing import Annotated, Any, get_args
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -99,7 +99,7 @@ class Experiment:
 
 
 def read_experiments(reports: Path) -> tuple[Experiment, ...]:
-    """The evaluations in the folders of `reports`, ordered by expert, fusion and name.
+    """The evaluations in the folders of `reports`, ordered by name.
 
     Evaluations whose trainings differ only in their seed or fold are one experiment. Other folders,
     such as the logs of a training, are skipped. Raises `ConfigError` if there is no evaluation, if
@@ -126,7 +126,7 @@ def read_experiments(reports: Path) -> tuple[Experiment, ...]:
     of_recipe: dict[str, list[Experiment]] = {}
     for experiment in experiments:
         of_recipe.setdefault(experiment.judged.policy.recipe, []).append(experiment)
-    return tuple(sorted(map(_merged, of_recipe.values()), key=_order))
+    return tuple(sorted(map(_merged, of_recipe.values()), key=lambda one: one.name))
 
 
 def best_experiment(experiments: Sequence[Experiment], span: str) -> Experiment:
@@ -293,11 +293,3 @@ def _check_shared(reports: Path, experiments: Sequence[Experiment], key: str) ->
                 + "\nEvaluate all of them with the same recordings, folds, evaluate.samples and "
                 "evaluate.batch_size, or move those that do not belong away."
             )
-
-
-def _order(experiment: Experiment) -> tuple[int, int, str]:
-    """Sorts experiments in the order of params.yaml's choices, then by name."""
-    experts, fusions = get_args(ModelType), get_args(FusionStrategy)
-    policy = experiment.judged.policy
-    expert, fusion = experts.index(policy.model_type), fusions.index(policy.fusion_strategy)
-    return expert, fusion, experiment.name

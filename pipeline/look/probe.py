@@ -3,16 +3,19 @@
 from collections import defaultdict
 from collections.abc import Sequence
 from functools import partial
+from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.image import AxesImage
 from numpy.typing import NDArray
 
 from pipeline.evaluate.probe.inputs import SlotName
 from pipeline.evaluate.probe.study import ProbeResult, ProbeStudy, recommend
 from pipeline.evaluate.probe.tables import advice, codec_table, notes, ranking
 from pipeline.look.page.blocks import Picture, Report, Section, Text, next_steps
-from pipeline.look.page.style import canvas, draw_map
+from pipeline.look.page.style import canvas
 from pipeline.vlm.slots import layer_name
 
 _MAPS = 6
@@ -99,13 +102,13 @@ def draw_gains(study: ProbeStudy) -> Figure:
     overview = figure.add_subplot(places[0, :])
     # A group of one slot is that slot.
     cells = [(rows.index(_row(r.name)), kinds.index(_column(r.name))) for r in named]
-    image = draw_map(overview, _grid(cells, [gains[r] for r in named]), limits)
+    image = _draw_map(overview, _grid(cells, [gains[r] for r in named]), limits)
     overview.set_xticks(range(len(kinds)), kinds)
     overview.set_yticks(range(len(rows)), rows)
     for index, title in enumerate(shown):
         axis = figure.add_subplot(places[1 + index // _MAPS_A_ROW, index % _MAPS_A_ROW])
         cells = [result.name.cell or (0, 0) for result in maps[title]]
-        draw_map(axis, _grid(cells, [gains[result] for result in maps[title]]), limits)
+        _draw_map(axis, _grid(cells, [gains[result] for result in maps[title]]), limits)
         axis.set(xticks=[], yticks=[])
         axis.set_title(title, fontsize=9)
 
@@ -123,6 +126,21 @@ def draw_gains(study: ProbeStudy) -> Figure:
         f"{len(study.folds.deals)} times"
     )
     return figure
+
+
+def _draw_map(axis: Axes, grid: NDArray[Any], limits: tuple[float, float]) -> AxesImage:
+    """The (row, column) values as coloured cells with their numbers; NaN is empty."""
+    low, high = limits
+    axis.grid(visible=False)
+    image = axis.imshow(grid, vmin=low, vmax=high, aspect="auto", interpolation="nearest")
+    decimals = 2 if high - low >= 0.1 else 3
+    for (row, column), value in np.ndenumerate(grid):
+        if np.isfinite(value):
+            light = np.dot(image.to_rgba(value)[:3], (0.3, 0.6, 0.1)) > 0.5
+            ink = "#111111" if light else "#ffffff"
+            words = f"{value:z.{decimals}f}"
+            axis.text(column, row, words, ha="center", va="center", color=ink, size=8)
+    return image
 
 
 def _grid(places: Sequence[tuple[int, int]], values: Sequence[float]) -> NDArray[np.float64]:

@@ -254,11 +254,3 @@ def test_the_model_proves_itself_before_the_first_episode(monkeypatch: pytest.Mo
     with pytest.raises(CheckpointMismatch, match="golden rows"):
         rolled(parts)
     assert not parts[2].passes
-
-
-def test_a_checkpoint_without_golden_rows_is_warned_of() -> None:
-    checkpoint, policy, glance = made()
-    said: list[str] = []
-    load: Any = lambda: glance  # noqa: E731
-    roll_out(checkpoint, "models/head", policy, load, wanted(episodes=1, ablations=[]), said.append)
-    assert said[0].startswith("WARNING: this checkpoint carries no golden rows")

@@ -20,7 +20,7 @@ from stages.command import run
 
 Said = pytest.CaptureFixture[str]
 
-NAMES = ["regression-concat", "regression-gated", "diffusion-concat", "flow_matching-none"]
+NAMES = ["diffusion-concat", "flow_matching-none", "regression-concat", "regression-gated"]
 
 
 @pytest.fixture(scope="module")

@@ -147,6 +147,14 @@ def test_a_store_of_recorded_rows_says_their_rate(capsys, params_file, tmp_path)
     assert FeatureStore.open(store).action_hz == 10
 
 
+def test_recorded_rows_without_a_rate(capsys, params_file, tmp_path, monkeypatch):
+    """No format of today lacks it: a clock of one row, by a reader that knows no rate."""
+    monkeypatch.setattr("pipeline.data.timeline._recorded_hz", lambda *_: None)
+    write_small_lerobot(tmp_path / "day1/run")
+    err = refused(capsys, params_file, "data.action_hz=null", "extract.plan=true")
+    assert re.search(r"day1/run.* a single action, which tells no rate.*Set data\.action_hz", err)
+
+
 def test_recordings_without_any_frame(capsys, params_file, tmp_path):
     info = write_small_lerobot(tmp_path / "day1/run") / "meta/info.json"
     features = json.loads(info.read_text())["features"]

@@ -176,8 +176,6 @@ def test_mistakes_end_in_one_message(write_params: Make, tmp_path: Path, capsys:
     for override, said in (
         ("finetune.tuning.method=none", "python -m stages.train_head"),
         ("train_head.features_enabled=false", "would not see the model"),
-        ("finetune.lr=-1", "finetune.lr"),
-        ("train_head.store=nowhere.zarr", "no finished store"),
         ("vlm.prompt=look", 'prompt: "{instruction}'),
         ("data.sources=[{name: other, path: .}]", "no source has it"),
         ("vlm.dtype=float16", 'compute_dtype: "float32" -> "float16"'),

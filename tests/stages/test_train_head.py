@@ -172,7 +172,6 @@ def test_mistakes_end_in_one_message(write_params: Make, tmp_path: Path, capsys:
     for override, said in (
         ("train_head.store=nowhere.zarr", "no finished store"),
         ("train_head.device=cuda:77", "device: cuda:77"),
-        ("train_head.lr=-1", "train_head.lr"),
         ("train_head.sensor_encoder.heads=3", "heads must divide"),
     ):
         layers = ["--set", "train_head.sensor_encoder.layers=1"]

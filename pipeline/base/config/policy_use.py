@@ -192,7 +192,7 @@ class PushParams(Section):
     """Whether a new repository is private. A policy carries a few camera frames (golden rows), a
     store all streams: look at them before you publish."""
     card_only: bool = False
-    """Print the card and the list of files, and upload nothing."""
+    """Print the card, upload nothing."""
 
 
 class ExportParams(Section):

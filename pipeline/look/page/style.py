@@ -17,10 +17,8 @@ import numpy as np
 from markupsafe import escape
 from matplotlib import font_manager
 from matplotlib.axes import Axes
-from matplotlib.colors import Colormap
 from matplotlib.figure import Figure
 from matplotlib.gridspec import GridSpec
-from matplotlib.image import AxesImage
 from numpy.typing import NDArray
 from PIL import Image
 
@@ -100,28 +98,6 @@ def draw_frame(axis: Axes, frame: NDArray[np.uint8]) -> None:
     axis.set(xticks=[], yticks=[])
     axis.grid(visible=False)
     axis.spines[:].set_visible(False)
-
-
-def draw_map(
-    axis: Axes,
-    grid: NDArray[Any],
-    limits: tuple[float, float],
-    colours: str | Colormap = "viridis",
-    numbered: bool = True,
-) -> AxesImage:
-    """The (row, column) values as coloured cells with their numbers; NaN is empty."""
-    low, high = limits
-    axis.grid(visible=False)
-    image = axis.imshow(grid, colours, vmin=low, vmax=high, aspect="auto", interpolation="nearest")
-    decimals = 2 if high - low >= 0.1 else 3
-    for (row, column), value in np.ndenumerate(grid) if numbered else ():
-        if np.isfinite(value):
-            light = np.dot(image.to_rgba(value)[:3], (0.3, 0.6, 0.1)) > 0.5
-            ink = "#111111" if light else "#ffffff"
-            axis.text(
-                column, row, f"{value:z.{decimals}f}", ha="center", va="center", color=ink, size=8
-            )
-    return image
 
 
 def shorten_middle(name: str, begin: int, end: int) -> str:

@@ -118,17 +118,6 @@ def test_each_known_block_keeps_its_own_penalties(
         np.testing.assert_array_equal(score.penalties[repeat], chosen)
 
 
-def test_no_inputs_are_the_mean_of_the_others(rows: Rows, r2_by_fold: ByFold) -> None:
-    _, y, folds = rows
-    score = cross_validate(np.empty((200, 0)), y, folds, PENALTIES)
-    for held in range(4):
-        here = folds.fold[0] == held
-        mean = y[~here].mean(0)
-        expected = 1 - ((y[here] - mean) ** 2).mean(0)[:3] / y.var(0)[:3]
-        np.testing.assert_allclose(r2_by_fold(score, folds)[held, :3], expected, atol=1e-10)
-    assert score.mean < 0
-
-
 def test_a_penalty_below_rounding_is_refused(rows: Rows) -> None:
     x, y, folds = rows
     with pytest.raises(NumericsError, match="one is too small for 14 inputs"):

@@ -199,22 +199,6 @@ def test_what_is_known_grows_by_what_the_store_has(
     assert [(known.name, known.inputs) for known in study.known] == [("past actions", 2 * 5)]
 
 
-def test_a_slot_that_says_what_the_robot_just_did_gains_nothing(
-    tiny_store: Make, tmp_path: Path
-) -> None:
-    """Its features are the action of the tick before: alone they seem to know the next one."""
-    store = FeatureStore.open(tiny_store(tmp_path, episodes=20))
-    rng = np.random.default_rng(0)
-    action = np.cumsum(rng.normal(size=(20, 30, 4)), axis=1).reshape(-1, 4).astype(np.float32)
-    store.array("tick/action")[:, :4] = action
-    rows = store.array("tick/vl_row")
-    first = np.flatnonzero(np.diff(rows, prepend=-1))
-    store.array("vl/features")[:, 1, :4] = action[np.maximum(first - 1, 0)]
-    study = probed(store, horizon=1)
-    assert study.slots[1].alone.mean > 0.5
-    assert study.gain(study.slots[1]).value < 0.02
-
-
 def test_the_cheapest_of_those_that_are_tied_is_recommended(
     tiny_store: Make, tmp_path: Path, renamed: Make
 ) -> None:
@@ -234,21 +218,6 @@ def test_the_cheapest_of_those_that_are_tied_is_recommended(
     said = advice(study)
     assert "vlm: {layers: [2], norms: [false], pooling: [mean]}" in said
     assert "ahead of these by a difference that is not resolved" in said
-
-
-def test_a_joint_that_moves_in_one_recording_spoils_nothing(store: FeatureStore) -> None:
-    """It rests in what is trained on when that one is held out: thousands in units of its rest."""
-    before = probed(store)
-    state, ends = store.array("state/values"), store.array("tick/state_end")
-    rng = np.random.default_rng(2)
-    state[:, 0] = 1.6 + 1e-6 * rng.normal(size=len(state))
-    first = ends[59]
-    state[first : ends[89], 0] += np.linspace(0, 1, ends[89] - first)
-    # So small a movement goes with the action by chance: this is what is blown up.
-    study = probed(store)
-    assert study.baseline.score.mean == pytest.approx(before.baseline.score.mean, abs=0.2)
-    for one in (*study.slots, *study.groups):
-        assert (one.beside.explained / one.beside.rows).min() > -1.5
 
 
 def by_recording(*values: float) -> ProbeScore:
