@@ -51,6 +51,7 @@ from pipeline.base.scheduler import client_of, private_cluster, quiet
 from pipeline.data.episode import RowFrames, by_episode
 from pipeline.extract.engine import RowEngine, Speed
 from pipeline.extract.rows import FeatureBlock, Row, RowMarks, WrittenRows, row_frames
+from pipeline.extract.state import row_sources
 from pipeline.extract.survey import Survey
 from pipeline.store import FEATURES, RowSource, StoreBuild, part_path, read_plan
 from pipeline.store.schema import read_specs
@@ -178,7 +179,7 @@ class ExtractionPlugin(WorkerPlugin):
         with self._opening:
             if self._engine is None:
                 self.check_place()
-                surveyed, known = self.surveyed, [RowSource(path) for path in self.known]
+                surveyed, known = self.surveyed, row_sources(self.known, self.surveyed)
                 specs = read_specs(part_path(surveyed.target))
                 self._build = StoreBuild(surveyed.target, specs, surveyed.plan)
                 frames = row_frames(self._build, surveyed)

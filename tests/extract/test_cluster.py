@@ -78,8 +78,6 @@ def encoded(self, rows, encode=encode):
             name = Path(one.where.split(",")[0]).name
             if (control / f"nan-{{name}}").exists():
                 raise NumericsError(f"{{one.where}}: expected finite features")
-        if (control / "wait-for-three").exists():
-            wait_until(lambda: len(rows_by_process()) == 3)
         yield batch, features
 
 def note(rows):
@@ -231,21 +229,6 @@ class TestStore:
         assert np.array_equal(store.array("vl/features"), before)
         assert "torch" in store.attrs["environment"][0]
 
-    def test_equal_rows_of_a_range_are_computed_once(
-        self, changed, recordings, workers, stand_still, tmp_path
-    ):
-        stand_still(recordings / "Touch_dot" / "episode_2")
-        params = changed(extract={"workers": workers.address})
-        report = run(params)[0]
-        expected = changed(extract={"store": str(tmp_path / "expected.zarr")})
-        one = run(expected)[0]
-        assert one.computed < report.computed < report.rows, "equal rows of two ranges are not"
-        assert report.computed + report.repeated == report.rows
-        assert_same(
-            FeatureStore.open(params.extract.store), FeatureStore.open(expected.extract.store)
-        )
-        assert workers.computed()[0].total() == report.computed
-
 
 class TestDeaths:
     @pytest.mark.slow
@@ -268,31 +251,6 @@ class TestDeaths:
         )
         times, _ = workers.computed()
         assert 1 <= times.total() - len(times) <= BATCH
-
-    @pytest.mark.slow
-    def test_a_worker_that_joins_later_takes_part(self, changed, workers, here, monkeypatch, begun):
-        mark = StoreBuild.mark
-        joined: list[Process] = []
-
-        def joined_after_first(self, *args):
-            if not joined:
-                joined.append(begun("worker", workers.address, *WORKER, "--preload", preload))
-                workers.cluster.wait_for_workers(3, timeout=PATIENCE_S)
-                workers.ask("wait-for-three")
-            mark(self, *args)
-
-        preload = str(workers.preload)
-        monkeypatch.setattr(StoreBuild, "mark", joined_after_first)
-        # Few ahead: of the twelve tasks some are left when the third is there.
-        monkeypatch.setattr("pipeline.extract.cluster._TASKS_AHEAD", 4)
-        params = changed(extract={"workers": workers.address, "batch_size": 1})
-        try:
-            run(params)
-        finally:
-            for process in joined:
-                process.kill()
-        assert_same(FeatureStore.open(params.extract.store), here)
-        assert len(workers.computed()[1]) == 3
 
     def test_poisoned_recordings_are_reported_when_all_others_are_done(
         self, changed, recordings, write_episode, workers, tmp_path

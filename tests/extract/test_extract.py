@@ -5,7 +5,7 @@ import os
 import shutil
 import subprocess
 import sys
-from contextlib import closing, suppress
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -20,17 +20,13 @@ from pipeline.base.errors import (
     NumericsError,
     RecordingError,
     StoreIncomplete,
-    StoreLocked,
     StoreMismatch,
 )
 from pipeline.data import Channels, RecordedAction, Stream, open_recordings
-from pipeline.data.lerobot_rows import stored_clock
 from pipeline.data.timeline import build_timeline
 from pipeline.data.windowed import WindowedRecording
 from pipeline.extract.survey import survey
-from pipeline.simulation.insertion_formats import write_lerobot
-from pipeline.simulation.recorder import simulate_episode
-from pipeline.store import FeatureStore, StoreBuild, build_lock, part_path
+from pipeline.store import FeatureStore, StoreBuild, part_path
 from pipeline.store.schema import ARRAY_NAMES, INCREMENTAL
 from pipeline.vlm.feature_spec import feature_spec
 from pipeline.vlm.preparation import Preparer
@@ -82,35 +78,6 @@ def no_model_later(monkeypatch):
             monkeypatch.setattr(Image, "open", refuse)
 
     return begin
-
-
-def test_clocks_that_are_read_exactly_now_are_all_that_changes_in_a_store(
-    changed, tmp_path, monkeypatch, no_model_later
-):
-    """An earlier reader kept the clocks of LeRobot sets as stored, and ticks saw no rounding."""
-    write_lerobot(tmp_path / "set", iter([simulate_episode(4, 0.0)]))
-    source = {"name": "made", "path": str(tmp_path / "set"), "action_kind": "absolute"}
-    data = {"sources": [source], "action_hz": 10, "views": ["View1"], "vlm_reuse_count": 1}
-    params = changed(data=data, vlm={"pooling": ["mean"]})
-    with monkeypatch.context() as earlier:
-        as_stored = lambda table, fps, where: stored_clock(table, where)  # noqa: E731
-        earlier.setattr("pipeline.data.lerobot.read_clock", as_stored)
-        earlier.setattr("pipeline.data.timeline.rounding", lambda clock: 0.0)
-        run(params)
-    before = FeatureStore.open(params.extract.store)
-    no_model_later(images=False)
-    report, said = run(params)
-    store = FeatureStore.open(params.extract.store)
-    assert (report.taken, report.computed) == (report.rows, 0)
-    assert any("have other files, how these are read" in line for line in said)
-    exact = np.arange(len(store.array("tick/time"))) / 10
-    clocks = {"tick/time", "vl/time", "state/time"}
-    for name in clocks:
-        assert np.array_equal(store.array(name), exact)
-        assert np.array_equal(before.array(name), exact.astype(np.float32))
-    assert np.array_equal(store.array("vl/frame_time")[:, 0], exact)
-    for name in {*ARRAY_NAMES} - clocks - {"vl/frame_time", "episode/text", "episode/text_start"}:
-        assert np.array_equal(store.array(name), before.array(name)), name
 
 
 class TestWhatItWrites:
@@ -509,32 +476,6 @@ class TestWhatWouldBeLost:
             run(params)
         assert [contents(Path(copy)) for copy in copies] == before
 
-    @pytest.mark.usefixtures("extracted")
-    @pytest.mark.parametrize(
-        "step", [1, 3, *(pytest.param(step, marks=pytest.mark.slow) for step in (0, 2))]
-    )
-    def test_a_kill_while_it_is_kept_leaves_both(self, params, unmount, monkeypatch, step):
-        unmount()
-        steps = 0
-
-        def counting(real):
-            def call(*arguments, **keywords):
-                nonlocal steps
-                if "made.zarr" in arguments[0].parts[-1] and (steps := steps + 1) > step:
-                    raise KeyboardInterrupt
-                return real(*arguments, **keywords)
-
-            return call
-
-        with monkeypatch.context() as patch:
-            patch.setattr(Path, "rename", counting(Path.rename))
-            with suppress(KeyboardInterrupt):
-                run(params)
-        run(params)
-        assert len(FeatureStore.open(params.extract.store).episodes) == 2
-        kept = params.extract.store.with_name("made.zarr.previous")
-        assert len(FeatureStore.open(kept).episodes) == 3
-
 
 def test_recordings_without_a_camera(changed):
     params = changed(data={"views": []}, vlm={"pooling": ["mean", "text_mean"]})
@@ -608,6 +549,7 @@ class TestPlan:
         notes = [line for line in lines if "ticks at" in line]
         assert notes == ([] if said is None else [f"source 'made': {said}"])
 
+    @pytest.mark.usefixtures("extracted")
     def test_names_a_time_once_a_speed_is_known(self, changed):
         for sections in {"data": {"vlm_reuse_count": 2}}, {"vlm": {"prompt": "{images}"}}:
             _, said = run(changed(extract={"plan": True}, **sections))
@@ -629,23 +571,6 @@ class TestRefusals:
         with pytest.raises(DiskFull, match=r"needs \d.*B, .* has \d.*B free"):
             run(params)
         assert not params.extract.store.exists()
-
-    def test_a_disk_that_fills_up_ends_in_an_error_and_a_build_that_resumes(
-        self, changed, small_disk, monkeypatch
-    ):
-        ballast = small_disk / "ballast"
-        ballast.write_bytes(bytes(6 * 2**20))
-        store = {"store": str(small_disk / "made.zarr"), "sensor_dtype": "float16"}
-        params = changed(extract=store)
-        with monkeypatch.context() as patch:
-            patch.setattr("pipeline.extract.layout.free_bytes", lambda path: 2**40)
-            with pytest.raises(DiskFull, match=r"no space left.*make room and run the same"):
-                run(params)
-        assert not params.extract.store.exists()
-        ballast.unlink()
-        report, _ = run(params)
-        assert FeatureStore.open(params.extract.store).ticks == 68
-        assert report.computed == report.rows
 
     def test_lists_everything_that_is_wrong_at_once(self, params, recordings, no_model_later):
         no_model_later(images=False)
@@ -689,11 +614,6 @@ class TestRefusals:
             run(params)
         assert not part_path(params.extract.store).exists()
 
-    def test_as_many_ticks_a_row_as_params_allow_can_be_read_again(self, changed):
-        params = changed(data={"vlm_reuse_count": 1_000_000}, vlm={"pooling": ["mean"]})
-        run(params)
-        assert len(FeatureStore.open(params.extract.store).episodes) == 3
-
     def test_skip_leaves_bad_episodes_out_and_lists_them_every_time(
         self, changed, recordings, no_model_later, counted, write_episode, monkeypatch
     ):
@@ -733,18 +653,3 @@ class TestRefusals:
             StoreMismatch, match=r"the sensor of source 'made'.*'second'.*7 channels.*two stores"
         ):
             run(changed(data={"sources": sources}))
-
-    def test_a_second_extraction_is_refused(self, params):
-        with build_lock(params.extract.store), pytest.raises(StoreLocked, match="being built by"):
-            run(params)
-
-
-@pytest.mark.usefixtures("extracted")
-def test_finished_files_never_change(params, recordings, tmp_path, write_episode):
-    """Hard links to a finished store, as a cache makes them, keep their bytes."""
-    cache = tmp_path / "cache"
-    shutil.copytree(params.extract.store, cache, copy_function=lambda a, b: Path(b).hardlink_to(a))
-    before = {path: path.read_bytes() for path in cache.rglob("*") if path.is_file()}
-    write_episode(recordings / "Touch_dot" / "episode_7", 7)
-    run(params)
-    assert {path: path.read_bytes() for path in before} == before

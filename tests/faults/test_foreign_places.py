@@ -19,11 +19,6 @@ WRITERS: dict[str, tuple[str, str, tuple[str, ...]]] = {
     "plan": ("stages.extract", "x.zarr", ("extract.store={}", "extract.plan=true")),
     "build": ("stages.extract", "stores/made.zarr.part", ()),
     "ledger": ("stages.extract", "x.zarr.files.sqlite", ("extract.store={tmp}/x.zarr",)),
-    "planned ledger": (
-        "stages.extract",
-        "x.zarr.files.sqlite",
-        ("extract.store={tmp}/x.zarr", "extract.plan=true"),
-    ),
     "lost": ("stages.extract", "stores/made.zarr.previous", (PRESS,)),
     "recordings": ("stages.demo", "demo", ("demo.recordings={}",)),
     "checkpoint": ("stages.demo", "vlm", ("demo.checkpoint={}",)),

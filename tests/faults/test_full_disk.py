@@ -87,14 +87,3 @@ def test_train_and_evaluate(
     assert (output / "best" / "policy.json").exists()
     full_then_free(5_000, "stages.evaluate", params)
     assert (report / "metrics.json").exists()
-
-
-def test_merge(tiny_store, head_params, small_disk, full_then_free, tmp_path):
-    inputs = [
-        str(tiny_store(tmp_path, name=name, seed=seed, sensor_channels=50))
-        for seed, name in enumerate("ab")
-    ]
-    words = ["merge", *inputs, "--into", str(small_disk / "both.zarr")]
-    params = head_params(Path("unused.zarr"))
-    full_then_free(200_000, "stages.store", params, *words)
-    assert len(FeatureStore.open(small_disk / "both.zarr").episodes) == 12

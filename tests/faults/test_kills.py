@@ -11,16 +11,12 @@ from typing import Any
 
 import pytest
 
-from pipeline.store.chunks import ChunkFiles
 from pipeline.train.loop import Trainer
-from stages import store, train_head
+from stages import train_head
 from stages.command import run
-from tests.store.samples import content
 
 AHEAD = 4
 """Steps or writes that a process goes on for and then waits, however late its kill comes."""
-WRITES = 20
-"""Most writes of a merge before its kill; the streams of two tiny stores take more."""
 
 
 def paced(owner: type, name: str, last: int, told: Connection) -> None:
@@ -40,12 +36,6 @@ def train(params: Path, last: int, told: Connection) -> None:
     """Train, and tell of each step."""
     paced(Trainer, "_train_step", last, told)
     run("", train_head.main, ["--params", str(params)])
-
-
-def merge(params: Path, words: list[str], last: int, told: Connection) -> None:
-    """Merge stores, and tell of each write."""
-    paced(ChunkFiles, "write", last, told)
-    run("", store.main, ["--params", str(params), *words], store.SHORTHANDS)
 
 
 @pytest.fixture
@@ -87,18 +77,3 @@ def test_a_training_killed_again_and_again(
         ]
         assert weights[0] == weights[1]
     assert not list((tmp_path / "killed").glob("head.part*"))
-
-
-def test_a_merge_killed_again_and_again(tiny_store, head_params, kill_after, here, tmp_path):
-    chance = random.Random(0)
-    inputs = [str(tiny_store(tmp_path, name=name, seed=seed)) for seed, name in enumerate("ab")]
-    params = head_params(Path("unused.zarr"))
-    words = ["merge", *inputs, "--into"]
-    merged = [*words, str(tmp_path / "killed.zarr")]
-    for _ in range(3):
-        kill_after(chance.randint(1, WRITES), 0.0, merge, params, merged)
-        assert not (tmp_path / "killed.zarr").exists()
-    for name in ("killed", "whole"):
-        code, _, complained = here("stages.store", params, *words, str(tmp_path / f"{name}.zarr"))
-        assert code == 0, complained
-    assert content(tmp_path / "killed.zarr") == content(tmp_path / "whole.zarr")
