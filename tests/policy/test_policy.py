@@ -237,6 +237,14 @@ class TestModalityDropout:
         # Of two that would both go, each is kept as often.
         assert left[1000:2000, 0].float().mean().item() == pytest.approx(0.5, abs=0.06)
 
+    def test_two_streams_share_what_one_of_them_must_keep(self):
+        """At rates p and q both would go from pq of the samples; each stays in half of these."""
+        before = self.everything(8000)
+        del before["state"]
+        after = drop_streams(before, {"features": 0.8, "sensor": 0.6}, seeded())
+        missing = [(v.reshape(8000, -1) == 0).all(1).float().mean().item() for v in after.values()]
+        assert missing == pytest.approx([0.8 - 0.24, 0.6 - 0.24], abs=0.02)
+
     def test_a_dropped_stream_is_one_that_is_missing(self, build_policy, observe):
         policy, seen = build_policy(drop_features=1.0, drop_sensor=1.0).train(), observe()
         trained, _ = policy.loss(seen, seen.action, seen.action_valid)

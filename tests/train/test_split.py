@@ -370,6 +370,12 @@ class TestCutByTime:
         assert not len(split.val) + len(split.test)
         assert "too short" in str(split.note)
 
+    def test_a_format_that_ends_before_the_cut_is_trained_on_whole(self):
+        store = FakeStore([100, 2], keys=[7, 7], late=[0.0, 0.0])
+        split = drawn(store, 8, val=0, test=0.2)
+        assert split.train.tolist() == [*range(73), 100, 101]
+        assert store.names(split.test) == {"s/episode_0"}
+
     def test_the_longest_horizon_that_leaves_a_tick(self):
         assert drawn(FakeStore([10]), 8, val=0, test=0.2).train.tolist() == [0]
         assert drawn(FakeStore([19]), 8, val=0.1, test=0.1).train.tolist() == [0]
