@@ -150,7 +150,8 @@ def row_sources(places: Sequence[Path], surveyed: Survey) -> list[RowSource]:
     """
     sources: list[RowSource] = []
     for path in places:
-        damaged = path == surveyed.target and read_plan(path) == surveyed.plan
+        is_target = path.absolute() == surveyed.target.absolute()  # workers have absolute paths
+        damaged = is_target and read_plan(path) == surveyed.plan
         try:
             source = RowSource(path, damaged=damaged)
         except StoreIncomplete:

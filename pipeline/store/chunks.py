@@ -194,9 +194,11 @@ def damages(
     """
     files = [(spec, chunk) for spec in specs for chunk in range(spec.chunk_count)]
     sums = None
-    if any(spec.name == FEATURES for spec, _ in files):
+    if features := next((spec for spec, _ in files if spec.name == FEATURES), None):
         with suppress(StoreIncomplete):  # a damaged file of checksums is named as such
-            sums = read_rows(root, read_spec(root, CHECKSUMS))
+            checksums = read_spec(root, CHECKSUMS)
+            if checksums.shape == features.shape[:1]:  # else the metadata are damaged
+                sums = read_rows(root, checksums)
 
     def check(file: tuple[ArraySpec, int]) -> tuple[Path, str]:
         spec, chunk = file

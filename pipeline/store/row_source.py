@@ -10,7 +10,14 @@ from numpy.typing import NDArray
 
 from pipeline.base.errors import StoreIncomplete
 from pipeline.store.border import EpisodeText
-from pipeline.store.chunks import check_chunks, find_damage, read_rows, row_checksums
+from pipeline.store.chunks import (
+    check_chunks,
+    find_damage,
+    read_chunk,
+    read_rows,
+    row_checksums,
+    sealed_trailer,
+)
 from pipeline.store.episodes import check_index, read_texts
 from pipeline.store.paths import laid_out_attributes
 from pipeline.store.schema import (
@@ -19,6 +26,7 @@ from pipeline.store.schema import (
     KEYS,
     ArraySpec,
     check_agreement,
+    chunk_paths,
     read_specs,
     rows_of,
 )
@@ -45,7 +53,7 @@ class RowSource:
     @cached_property
     def rows(self) -> dict[bytes, int]:
         """The row of each key."""
-        if self.damaged and self._changed(KEYS):
+        if self._unsure:
             return {}
         keys = self._read(KEYS)
         return {keys[row].tobytes(): int(row) for row in np.flatnonzero(self._read(CHECKSUMS))}
@@ -57,7 +65,7 @@ class RowSource:
         `vl/frame_time`) mean equal frames, so that no pixel needs to be decoded.
         """
         episodes = self._episodes_by_text.get((content, instruction), [])
-        if not episodes:
+        if not episodes or self._unsure:
             return {}
         names = ("episode/vl_start", "vl/frame_time", KEYS, CHECKSUMS)
         vl_start, frame_time, keys, checksums = map(self._read, names)
@@ -81,6 +89,26 @@ class RowSource:
         if row_checksums(values)[0] != self._read(CHECKSUMS)[row]:
             return None
         return values[0], environment_at(self._environments, row)
+
+    @cached_property
+    def _unsure(self) -> bool:
+        """Whether damage leaves no row of which key and features surely belong together.
+
+        Features and checksums of another store or an older copy fit each other.
+        """
+        if not self.damaged:
+            return False
+        try:
+            self._read(CHECKSUMS)
+        except StoreIncomplete:
+            return True
+        if self._changed(KEYS):
+            return True
+        spec, seal = self.specs[FEATURES], self.attributes.seal
+        return self._changed(CHECKSUMS) and any(
+            read_chunk(path, spec, sealed=sealed_trailer(seal, FEATURES, chunk)).damage
+            for chunk, path in enumerate(chunk_paths(self.path, spec))
+        )
 
     @cached_property
     def _episodes_by_text(self) -> dict[tuple[str, str], list[int]]:

@@ -2,16 +2,21 @@
 
 import json
 import shutil
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import google_crc32c
 import numpy as np
 import pytest
 
 from pipeline.base.config import Params
+from pipeline.base.digests import ContentDigests, ledger_path
 from pipeline.base.errors import StoreIncomplete, StoreMismatch
 from pipeline.extract import ExtractionReport, extract
+from pipeline.extract.state import row_sources
+from pipeline.extract.survey import survey
 from pipeline.store import FeatureStore, StoreBuild, part_path
 from pipeline.store.schema import chunk_paths, read_spec
 from pipeline.store.verification import verify
@@ -108,6 +113,45 @@ def test_changed_metadata_are_written_again_and_every_row_is_kept(case, place):
         run(case.params)
     assert case.mended().computed == 0
     assert contents(case.store) == contents(case.original)
+
+
+def test_features_and_checksums_of_an_older_copy_are_not_taken(case):
+    """They fit each other, but belong to other keys."""
+    for array in ("vl/features", "vl/checksum"):
+        spec = read_spec(case.store, array)
+        (path, *_) = chunk_paths(case.store, spec)
+        content, used = path.read_bytes()[:-4], spec.shape[0] * spec.row_bytes
+        content = content[spec.row_bytes : used] + content[: spec.row_bytes] + content[used:]
+        path.write_bytes(content + google_crc32c.value(content).to_bytes(4, "little"))
+    assert case.mended().computed == 24
+    assert contents(case.store) == contents(case.original)
+
+
+def test_lost_checksums_cost_the_rows(case):
+    (path, *_) = chunk_paths(case.store, read_spec(case.store, "vl/checksum"))
+    path.unlink()
+    assert case.mended().computed == 24
+    assert contents(case.store) == contents(case.original)
+
+
+def test_arrays_of_other_lengths_are_found_and_mended(case):
+    path = case.store / "vl" / "checksum" / "zarr.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"shape": [3]}))
+    assert any("metadata were changed" in issue for issue in verify(case.store).issues)
+    case.mended()
+    assert contents(case.store) == contents(case.original)
+
+
+def test_workers_may_take_rows_of_a_damaged_store(case, monkeypatch):
+    """They name it by its absolute path, wherever params are relative."""
+    case.flip("vl/key", 40)
+    store = case.store
+    monkeypatch.chdir(store.parent)
+    case.document["extract"] = case.document["extract"] | {"store": store.name}
+    with closing(ContentDigests.to_read(ledger_path(store))) as digests:
+        surveyed = survey(case.params, digests)
+    (source,) = row_sources([store], surveyed)
+    assert source.rows == {}
 
 
 def test_other_params_repair_nothing(case):
