@@ -257,7 +257,13 @@ def remote(params: Params) -> Generator[Callable[[], PolicySession]]:
         serving = next((line for line in server.stdout if line.startswith(SERVING)), None)
         if serving is None:
             raise RuntimeError(f"{' '.join(command)}: ended before it served")
-        yield lambda: leaving.enter_context(PolicyClient(serving.split()[1]))
+        connection = leaving.enter_context(ExitStack())
+
+        def connect() -> PolicyClient:
+            connection.close()  # the server takes a few robots at a time
+            return connection.enter_context(PolicyClient(serving.split()[1]))
+
+        yield connect
 
 
 @contextmanager

@@ -65,18 +65,6 @@ class OutputKind:
         return _marked(path) == self.name
 
 
-def begins_with(line: str) -> Callable[[Path], bool]:
-    """Recognises a file by the start of its first line; an empty file always counts."""
-
-    def begins(path: Path) -> bool:
-        if not path.is_file():
-            return False
-        with path.open(encoding="utf-8", errors="replace") as file:
-            return not (first := file.readline().strip()) or first.startswith(line)
-
-    return begins
-
-
 def there(path: Path) -> bool:
     """Whether anything has this name, even a dangling link."""
     return path.exists() or path.is_symlink()

@@ -352,7 +352,7 @@ class PolicyServer:
     def _is_authorized(self, request: Request) -> bool:
         if self._token is None:
             return True
-        given = ",".join(request.headers.get_all("Authorization")).encode()
+        given = ",".join(request.headers.get_all("Authorization")).encode(errors="replace")
         return hmac.compare_digest(given, f"Api-Key {self._token}".encode())
 
 

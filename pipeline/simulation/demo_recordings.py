@@ -70,6 +70,7 @@ def write_demo_recordings(root: Path, episodes: int, seed: int) -> None:
     `replace_demo`.
     """
     wanted = {"version": DEMO_VERSION, "episodes": episodes, "seed": seed}
+    recover_folder(root, DEMO)
     if (root / MARKER).exists() and all((root / name).is_dir() for name in _SETS):
         marked = BORDER.read_json(root / MARKER, _Marker)
         if marked.model_dump(include={*wanted}) == wanted:

@@ -125,6 +125,11 @@ def describe_data(
         f"split: {len(split.train)} training ticks, {len(split.val)} val, {len(split.test)} test "
         f"of {' + '.join(str(len(names)) for names in groups)} groups{cut}",
     ]
+    if (dtype := store.spec.get("storage_dtype")) in ("int8", "float8"):
+        lines.append(
+            f"features are stored in {dtype}; stages.probe with probe.codecs on a store in float32 "
+            "says what that loses"
+        )
     if anchored := shape.anchored(store.streams["action"]["names"]):
         lines.append(f"anchored at the newest frame: {', '.join(anchored)}")
     if not len(split.test):

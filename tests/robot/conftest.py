@@ -100,13 +100,6 @@ def build_policy(
     return checkpoint, policy, Glance()
 
 
-@pytest.fixture(scope="session")
-def phantom_policy() -> Callable[..., tuple[PolicyCheckpoint, Policy, Glance]]:
-    """`phantom_policy(model_type, key=value, ...)`: a policy of few random weights for the phantom,
-    its checkpoint, and what stands for its model."""
-    return build_policy
-
-
 class SimulatedTime:
     """A clock that only sleeping moves."""
 

@@ -103,6 +103,18 @@ def test_groups_that_were_cut_by_time_count_once(store, params):
     assert lines[1].endswith("of 1 + 1 + 1 groups (1 in all, cut by time)")
 
 
+def test_a_lossy_store_is_named_with_the_proof(store, params, monkeypatch):
+    train = np.arange(store.ticks)
+    shape = policy_shape(store, fit_normalization(store, train, WINDOWS))
+    named = {episode_name(episode): episode_name(episode) for episode in store.episodes}
+    split = Split(train, train[:0], train[:0], named, None)
+    assert not any("stored in" in line for line in describe_data(store, shape, params(), split))
+    lossy = store.spec | {"storage_dtype": "int8"}
+    monkeypatch.setattr(type(store), "spec", property(lambda own: lossy))
+    lines = describe_data(store, shape, params(), split)
+    assert any("stored in int8; stages.probe with probe.codecs" in line for line in lines)
+
+
 @pytest.fixture
 def warnings(store, params):
     """`warnings(train, key=value, ...)`: of a training on these ticks, the others held out."""

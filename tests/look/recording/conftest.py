@@ -9,7 +9,6 @@ from typing import Any
 import matplotlib as mpl
 import numpy as np
 import pytest
-from matplotlib.figure import Figure
 
 from pipeline.base.config import DataParams, Source
 from pipeline.base.errors import Issue
@@ -141,15 +140,3 @@ def felt(view: EpisodeView) -> Callable[..., EpisodeView]:
         return replace(view, sensor=stream, zero=0.0)
 
     return build
-
-
-@pytest.fixture
-def words_of() -> Callable[[Figure], str]:
-    """All that is written in a figure."""
-
-    def words(figure: Figure) -> str:
-        figure.draw_without_rendering()
-        texts = figure.findobj(lambda one: hasattr(one, "get_text"))
-        return "\n".join(text.get_text() for text in texts)  # type: ignore[attr-defined]
-
-    return words
