@@ -55,7 +55,7 @@ def test_a_set_is_what_the_expert_did_and_is_recorded_once(tmp_path: Path) -> No
     assert np.allclose(np.diff(state.time), 1 / HZ, atol=1e-6)
     assert first.instruction == instruction_of(asked.task)
     camera = first.cameras()[VIEW]
-    film = truth.frames[f"observation.images.{VIEW}"]
+    film = truth.films[f"observation.images.{VIEW}"]
     assert len(camera.time) == len(film)
     before = (folder / "meta" / "info.json").stat().st_mtime_ns
     assert record(tmp_path, [asked], jobs=1) == [kept]

@@ -54,11 +54,15 @@ class ContentDigests:
 
     @classmethod
     def to_read(cls, ledger: Path) -> "ContentDigests":
-        """A copy of the ledger in memory, as far as it can be read; the file stays as it is.
+        """The ledger, or a copy of it in memory where the file cannot be written.
 
         Raises `ConfigError` where something else lies there.
         """
         _refuse_foreign(ledger)
+        with suppress(OSError, PipelineError):
+            digests = cls(ledger)
+            digests._query("DELETE FROM known WHERE 0")  # a file that may only be read refuses it
+            return digests
         digests = cls(None)
         # immutable: otherwise sqlite creates files beside it.
         place = f"file:{quote(str(ledger.absolute()))}?mode=ro&immutable=1"

@@ -30,9 +30,6 @@ def test_a_damaged_ledger_is_begun_anew(tmp_path):
         digests.note_rate("model", 12.5)
     ledger.write_bytes(damaged := ledger.read_bytes()[:100] + b"no database" * 50)
     (tmp_path / "file").write_bytes(b"one")
-    with closing(ContentDigests.to_read(ledger)) as digests:
-        assert len(digests.of(tmp_path / "file")) == 32
-    assert ledger.read_bytes() == damaged, "what only reads removes nothing"
     with closing(ContentDigests(ledger)) as digests:
         assert digests.rate("model") is None
         assert len(digests.of(tmp_path / "file")) == 32

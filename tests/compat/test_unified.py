@@ -307,7 +307,7 @@ def test_the_arguments_it_has_always_had() -> None:
     assert (sensor.layers, sensor.heads, sensor.output_dim) == (2, 8, 1024)
     assert (state.dim, state.layers, state.heads, state.output_dim) == (256, 2, 8, 512)
     assert (expert.dim, expert.layers, expert.heads) == (512, 4, 8)
-    assert (params.diffusion.timesteps, params.diffusion.schedule) == (100, "cosine")
+    assert params.diffusion.timesteps == 100
     assert params.diffusion.prediction == "epsilon"
     assert shape == PolicyShape(
         1, 2048, 1026, 12, 7, ("translation",) * 3 + ("rotation",) * 3 + ("gripper",), views=5

@@ -74,7 +74,7 @@ def test_a_batch_hands_out_codes_and_the_policy_reads_numbers(stores, dtype):
     torch.testing.assert_close(policy.act(plain), read)
     # A stream that is off: its mean, whatever it is stored in, of two rows too.
     both = store.gather(ticks[:6], 4, 5, 5, feature_history=2)
-    off = zeroed("features", np.zeros((2 * shape.slots, shape.feature_dim)))(None, both)
+    off = zeroed("features", np.zeros((2 * shape.slots, shape.feature_dim)))(both)
     assert off.features.shape == (6, 2 * shape.slots, shape.feature_dim)
 
 

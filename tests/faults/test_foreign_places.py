@@ -44,7 +44,6 @@ WRITERS: dict[str, tuple[str, str, tuple[str, ...]]] = {
     ),
     "probe": ("stages.probe", "x", ("probe.output={}",)),
     "compare": ("stages.compare", "x", ("compare.output={}",)),
-    "table": ("stages.compare", "x.md", ("compare.output={tmp}/x",)),
 }
 """By name: the command, where something foreign lies, and what sets the command to write there."""
 
