@@ -110,8 +110,8 @@ def leftover(path: Path) -> StoreEntry:
 def remove_leftover(entry: StoreEntry) -> None:
     """Remove a build or a previous store; a store that a kill left in the build is put back first.
 
-    Raises `StoreLocked` where a process is building or has added rows since, `ConfigError` where this
-    project did not write what is there.
+    Raises `StoreLocked` where a process is building or has added rows since, and `ConfigError`
+    where this project did not write what is there.
     """
     with build_lock(entry.base):
         recover(entry.base)
