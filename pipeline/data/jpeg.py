@@ -213,9 +213,10 @@ def check_image_file(file: Path, limits: MediaLimits) -> int:
 
 
 def _folders(folder: Path) -> list[Path]:
-    """The folders in a folder, in natural order; none where it is not there."""
+    """The folders in a folder that are not hidden, in natural order; none where it is missing."""
     listed = entries(folder) if folder.is_dir() else []
-    return sorted((Path(entry.path) for entry in listed if entry.is_dir()), key=natural_key)
+    shown = (entry for entry in listed if not entry.name.startswith("."))
+    return sorted((Path(entry.path) for entry in shown if entry.is_dir()), key=natural_key)
 
 
 def _images(folder: Path) -> list[Path]:

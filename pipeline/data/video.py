@@ -131,6 +131,9 @@ class VideoClip(CameraStream):
                     "the episode out"
                 )
         table = np.array(sorted(packets, key=itemgetter(0)), np.int64).reshape(-1, 3).T
+        if (same := np.flatnonzero(np.diff(table[0]) == 0)).size:
+            why = f"frames {same[0]} and {same[0] + 1} of view {self.view!r} have the same time"
+            raise RECORDINGS.refusal(span.path, f"{why}, so that no seek tells them apart")
         return _FrameTable(*table)
 
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from pipeline.base.arrays import packed_dim
 from pipeline.base.commands import command
-from pipeline.base.errors import ConfigError, PipelineError
+from pipeline.base.errors import ConfigError, PipelineError, StoreLocked
 from pipeline.base.files import remove_folder
 from pipeline.base.text import Table, size
 from pipeline.store.archive import is_archive, read_manifest
@@ -110,11 +110,14 @@ def leftover(path: Path) -> StoreEntry:
 def remove_leftover(entry: StoreEntry) -> None:
     """Remove a build or a previous store; a store that a kill left in the build is put back first.
 
-    Raises `StoreLocked` where a process is building, and `ConfigError` where this project did not
-    write what is there.
+    Raises `StoreLocked` where a process is building or has added rows since, and `ConfigError`
+    where this project did not write what is there.
     """
     with build_lock(entry.base):
         recover(entry.base)
+        now = _entry(entry.path)
+        if now is not None and now.done > entry.done:
+            raise StoreLocked(f"{entry.path}: a build went on meanwhile. It was left as it is.")
         remove_folder(entry.path, KEPT if entry.kind == "previous" else STORE)
 
 

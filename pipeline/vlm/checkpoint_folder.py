@@ -276,7 +276,7 @@ def _present_weights(folder: Path) -> list[Path]:
     if not weights:
         why = "no *.safetensors file; pickled weights (*.bin, *.pt) are not opened"
         raise VLMS.refusal(folder, why)
-    if _WHOLE in weights or not (folder / _INDEX).exists():
+    if _WHOLE in weights:
         return sorted(folder / name for name in {_WHOLE, "config.json"})
     listed = set(VLMS.read_json(folder / _INDEX, _WeightIndex).weight_map.values())
     if missing := sorted(listed - weights):

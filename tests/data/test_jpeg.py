@@ -48,6 +48,7 @@ def test_a_name_without_a_time_is_named(name):
         ),
         (["View1/._a_1.jpg", "View1/notes.txt", "View2/a_1.JPG"], {"View2": 1}),
         (["view1/1.0.png", "View2/2.0.bmp", "View3/Thumbs.db"], {"View2": 1, "view1": 1}),
+        (["View1/1.0.jpg", ".View2/2.0.jpg"], {"View1": 1}),
     ],
 )
 def test_views_are_named_by_folder_and_eye(tmp_path, files, views):

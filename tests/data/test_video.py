@@ -181,3 +181,9 @@ def test_videos_are_of_few_kinds_and_within_limits(tmp_path, make, message):
         list(container.decode(stream))
     text = str(refused.value)
     assert text.count(str(path)) == 1 and "Errno" not in text
+
+
+def test_frames_of_one_time_are_refused(tmp_path, write):
+    path = write.video(tmp_path / "a.mkv", SHADES, 3000)  # Matroska counts milliseconds
+    with pytest.raises(RecordingError, match=r"a\.mkv: frames \d and \d of view 'top' have the sa"):
+        clip(path, 36).check([0])

@@ -206,6 +206,18 @@ class TestLeftovers:
         assert (outside / "zarr.json").exists()
 
 
+def test_a_build_that_went_on_since_it_was_listed_stays(tiny_store: Make, tmp_path: Path) -> None:
+    part = unfinish(tiny_store(tmp_path), 0)
+    empty = leftover(part)
+    assert is_unneeded(empty)
+    build = StoreBuild(tmp_path / "tiny.zarr", read_specs(part), "plan")
+    build.write("vl/checksum", 0, build.files("vl/checksum").read(0, 1) + 1)
+    build.close()
+    with pytest.raises(StoreLocked, match="went on meanwhile"):
+        remove_leftover(empty)
+    assert part.exists()
+
+
 def test_rows_of_a_build_that_was_set_aside_count(tiny_store: Make, tmp_path: Path) -> None:
     part = unfinish(tiny_store(tmp_path), 12)
     set_build_aside(tmp_path / "tiny.zarr")
