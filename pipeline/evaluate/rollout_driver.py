@@ -142,8 +142,8 @@ def _all(
     settings = wanted.model_dump(mode="json", exclude={"checkpoint", "output", "device"})
     described = ("checkpoint", "step", "weights", "model_type")
     settings |= {key: metadata[key] for key in described}
-    told = {driver.robot.level: driver.instruction for driver in drivers}
-    settings["instruction"] = told if len(drivers) > 1 else drivers[0].instruction
+    instructions = {driver.robot.level: driver.instruction for driver in drivers}
+    settings["instruction"] = instructions if len(drivers) > 1 else drivers[0].instruction
     return Rollouts(settings["checkpoint"], settings, tuple(episodes))
 
 

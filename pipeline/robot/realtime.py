@@ -152,8 +152,8 @@ def run_robot(
     if recorder is not None:
         try:
             timings = {"tick_ms": report.tick_timings, "answer_ms": report.answer_timings}
-            told = {name: own.document() for name, own in timings.items()}
-            report.recording = recorder.finish(report.reason, told)
+            documents = {name: own.document() for name, own in timings.items()}
+            report.recording = recorder.finish(report.reason, documents)
         except Exception as error:  # The report still says why the robot stands still.
             report.traceback += f"no recording: {type(error).__name__}: {error}"
     return report
