@@ -111,13 +111,19 @@ def remove_leftover(entry: StoreEntry) -> None:
     """Remove a build or a previous store; a store that a kill left in the build is put back first.
 
     Raises `StoreLocked` where a process is building or has added rows since, and `ConfigError`
-    where this project did not write what is there.
+    where this project did not write what is there, and for a previous store without the store that
+    replaced it: a kill left it as the only copy.
     """
     with build_lock(entry.base):
         recover(entry.base)
         now = _entry(entry.path)
         if now is not None and now.done > entry.done:
             raise StoreLocked(f"{entry.path}: a build went on meanwhile. It was left as it is.")
+        if entry.kind == "previous" and not is_store(entry.base):
+            raise ConfigError(
+                f"{entry.path}: expected the store that replaced it, found none at {entry.base}. "
+                "It was left as it is: run the extraction again, or rename it to that name."
+            )
         remove_folder(entry.path, KEPT if entry.kind == "previous" else STORE)
 
 

@@ -152,6 +152,13 @@ class TestLeftovers:
         assert not part.exists()
         assert FeatureStore.open(store).ticks == 180
 
+    def test_a_previous_store_without_its_successor_stays(self, tiny_store: Make, tmp_path: Path):
+        previous = tiny_store(tmp_path).rename(previous_path(tmp_path / "tiny.zarr"))
+        mark(previous, KEPT)
+        with pytest.raises(ConfigError, match="expected the store that replaced it"):
+            remove_leftover(leftover(previous))
+        assert previous.exists()
+
     @pytest.mark.parametrize("state", ["begun", "damaged", "sealed", "kept"])
     def test_a_removal_that_was_killed_leaves_what_the_next_build_takes(
         self, tiny_store: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, state: str
