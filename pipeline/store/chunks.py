@@ -220,15 +220,18 @@ def _chunk_damage(
     root: Path, spec: ArraySpec, chunk: int, sealed: bytes | None, sums: NDArray[np.uint32] | None
 ) -> str:
     """What is wrong with a chunk file, if anything; `sums` are those of all feature rows."""
-    rows, bad = np.array(spec.chunk_rows_of(chunk)), list[int]()
+    path, bad = chunk_path(root, spec, chunk), list[int]()
+    if sums is None:
+        return read_chunk(path, spec, sealed=sealed).damage or ""
+    rows = spec.chunk_rows_of(chunk)
 
     def compare(first: int, values: NDArray[Any]) -> None:
         within = rows[first : first + len(values)]  # the rest is padding
-        if sums is not None and len(within):
-            wrong = row_checksums(values[: len(within)]) != sums[within]
-            bad.extend(within[wrong].tolist())
+        if within:
+            wrong = row_checksums(values[: len(within)]) != sums[within.start : within.stop]
+            bad.extend((within.start + np.flatnonzero(wrong)).tolist())
 
-    what = read_chunk(chunk_path(root, spec, chunk), spec, compare, sealed).damage
+    what = read_chunk(path, spec, compare, sealed).damage
     if not bad:
         return what or ""
     return _wrong_rows(spec, bad) if what is None else f"{what}; {_wrong_rows(spec, bad)}"
