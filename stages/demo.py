@@ -25,12 +25,12 @@ def main(params: "Params") -> None:
     """Write the recordings under `demo.recordings` and the checkpoint at `demo.checkpoint`."""
     from pipeline.base.files import refuse_foreign
     from pipeline.simulation.demo_recordings import DEMO, replace_demo, write_demo_recordings
-    from pipeline.vlm.demo_checkpoint import write_demo_checkpoint
+    from pipeline.vlm.demo_checkpoint import write_checkpoint_files
 
     demo = params.demo
     refuse_foreign(demo.checkpoint, DEMO)
     write_demo_recordings(demo.recordings, demo.episodes, demo.seed)
-    write = partial(write_demo_checkpoint, seed=demo.seed)
+    write = partial(write_checkpoint_files, seed=demo.seed)
     replace_demo(demo.checkpoint, {"seed": demo.seed}, write)
     print(f"{demo.episodes} episodes a format in {demo.recordings}, checkpoint {demo.checkpoint}")
 

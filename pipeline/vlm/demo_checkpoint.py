@@ -40,7 +40,7 @@ def write_demo_checkpoint(folder: Path, seed: int = 0) -> None:
     An earlier one there is replaced. Raises `DiskFull`, and `ConfigError` where something else is
     there.
     """
-    replace_folder(folder, partial(_write, seed=seed), DEMO_CHECKPOINT)
+    replace_folder(folder, partial(write_checkpoint_files, seed=seed), _CHECKPOINT)
 
 
 def _is_demo(folder: Path) -> bool:
@@ -48,11 +48,11 @@ def _is_demo(folder: Path) -> bool:
     return config.is_file() and f'"vocab_size": {_VOCABULARY}' in config.read_text("utf-8")
 
 
-DEMO_CHECKPOINT = OutputKind("a demo", _is_demo)
-"""It has the name of the demo's other outputs, because it is written into one of them."""
+_CHECKPOINT = OutputKind("the demo's checkpoint", _is_demo)
 
 
-def _write(folder: Path, seed: int) -> None:
+def write_checkpoint_files(folder: Path, seed: int) -> None:
+    """Write the files of the demo's checkpoint into an existing folder."""
     for name in ("tokenizer_config.json", "preprocessor_config.json"):
         shutil.copyfile(_FILES / name, folder / name)
     _train_tokenizer().save(str(folder / "tokenizer.json"))

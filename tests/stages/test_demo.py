@@ -36,7 +36,7 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> list[tuple[object, ...]]:
     """What recordings were asked for; they and the checkpoint are written in no time."""
     made: list[tuple[object, ...]] = []
     monkeypatch.setattr(demo_recordings, "write_demo_recordings", lambda *given: made.append(given))
-    monkeypatch.setattr(demo_checkpoint, "write_demo_checkpoint", write_weights)
+    monkeypatch.setattr(demo_checkpoint, "write_checkpoint_files", write_weights)
     return made
 
 
@@ -61,7 +61,7 @@ def test_stopped_while_it_writes_the_same_command_goes_on(params, tmp_path, monk
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patched:
-        patched.setattr(demo_checkpoint, "write_demo_checkpoint", stopped)
+        patched.setattr(demo_checkpoint, "write_checkpoint_files", stopped)
         assert ran(params) == 1
     assert capsys.readouterr().err == "stopped; run the same command again\n"
     assert not (tmp_path / "vlm").exists()
