@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 
 from experiments.metaworld.protocol import VARIANTS, Run, TrainedPolicy
 from pipeline.base.text import Table
-from pipeline.evaluate.rollouts import SuccessRate
+from pipeline.evaluate.rollouts import SuccessRate, error_bars
 from pipeline.look.page.blocks import Picture, Report, Section, Text
 from pipeline.look.page.style import PALETTE, finish, panels
 from pipeline.look.page.writing import write_report
@@ -135,15 +135,14 @@ def _draw(by_variant: dict[str, list[Judged]]) -> Figure:
             ended = [s for p in own if whole or p.task == label for s in p.last]
             if not ended:  # this variant was run on other tasks
                 continue
-            rate = SuccessRate.of(ended)
+            centre, bars = error_bars([SuccessRate.of(ended)])
             height = at + 0.8 * (place + 0.5) / len(by_variant)
-            bars = [[100 * (rate.rate - rate.low)], [100 * (rate.high - rate.rate)]]
             style = {
                 "color": PALETTE[place % len(PALETTE)],
                 "label": None if name in named else name,
             }
             named.add(name)
-            axis.errorbar(100 * rate.rate, height, xerr=np.maximum(bars, 0), fmt="o", **style)
+            axis.errorbar(centre, height, xerr=bars, fmt="o", **style)
     axis.set(xlim=(-2, 102), xlabel="success [%]", yticks=np.arange(len(labels)) + 0.4)
     axis.set_yticklabels(labels)
     axis.invert_yaxis()
@@ -154,20 +153,19 @@ def _draw(by_variant: dict[str, list[Judged]]) -> Figure:
 def _draw_reuse(by_variant: dict[str, list[Judged]]) -> Figure:
     own = {REUSE[name]: policies for name, policies in by_variant.items() if name in REUSE}
     shared = [task for task in INSTRUCTIONS if all(task in _tasks(p) for p in own.values())]
+    counts = sorted(own)
     figure, axis = panels(6.0, 3.4, 1, 1)
     for place, label in enumerate([*shared, f"mean of {len(shared)}"]):
         tasks = [label] if label in shared else shared
-        rates = [
-            SuccessRate.of([s for p in own[ticks] if p.task in tasks for s in p.last])
-            for ticks in sorted(own)
-        ]
-        middle = np.array([100 * rate.rate for rate in rates])
-        bars = [middle - [100 * r.low for r in rates], [100 * r.high for r in rates] - middle]
-        moved = np.array(sorted(own)) * 1.03 ** (place - 1)  # so that intervals stay apart
+        centre, bars = error_bars(
+            SuccessRate.of([s for p in own[count] if p.task in tasks for s in p.last])
+            for count in counts
+        )
+        moved = np.array(counts) * 1.03 ** (place - 1)  # so that intervals stay apart
         style = {"color": PALETTE[place], "label": label, "marker": "o", "capsize": 2}
-        axis.errorbar(moved, middle, yerr=np.maximum(bars, 0), **style)
+        axis.errorbar(moved, centre, yerr=bars, **style)
     axis.set(xscale="log", ylim=(0, 104), xlabel="control ticks a pass", ylabel="success [%]")
-    axis.set_xticks(sorted(own), [f"{n}\n{HZ / n:.3g} a second" for n in sorted(own)], minor=False)
+    axis.set_xticks(counts, [f"{n}\n{HZ / n:.3g} a second" for n in counts], minor=False)
     axis.minorticks_off()
     finish(figure, axis, 1, "Success against vlm_reuse_count")
     return figure

@@ -4,11 +4,12 @@ The environment defines success and the reasons of failure. Rates have Wilson in
 """
 
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.stats import binomtest
 
 from pipeline.base.config import latencies_ms
@@ -71,6 +72,14 @@ class SuccessRate:
 
     def __str__(self) -> str:
         return f"{self.rate:.0%} ({self.low:.0%} to {self.high:.0%})"
+
+
+def error_bars(
+    rates: Iterable[SuccessRate],
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Rates in percent (rate,), and how far their intervals reach down and up (2, rate)."""
+    centre, low, high = 100 * np.array([(r.rate, r.low, r.high) for r in rates]).T
+    return centre, np.maximum([centre - low, high - centre], 0)
 
 
 @dataclass(frozen=True)

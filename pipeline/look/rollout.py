@@ -9,7 +9,13 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from pipeline.evaluate.rollouts import RolloutEpisode, Rollouts, SuccessRate, controller_name
+from pipeline.evaluate.rollouts import (
+    RolloutEpisode,
+    Rollouts,
+    SuccessRate,
+    controller_name,
+    error_bars,
+)
 from pipeline.look.page.blocks import Block, Outline, Picture, Report, Section, Text, next_steps
 from pipeline.look.page.style import INK, PALETTE, canvas, draw_strip, finish, panels
 from pipeline.look.page.writing import sentence
@@ -115,9 +121,8 @@ def _lateness(rollouts: Rollouts) -> Iterator[Section]:
 def draw_latency(rates: Mapping[float, SuccessRate]) -> Figure:
     """The success of the policy against the duration of a model pass."""
     figure, axis = panels(_WIDTH, 3.6, 1, 1)
-    centre, low, high = 100 * np.array([(r.rate, r.low, r.high) for r in rates.values()]).T
-    bars = np.stack([centre - low, high - centre])
-    axis.errorbar([*rates], centre, np.maximum(bars, 0), fmt="o-", capsize=3, color=PALETTE[0])
+    centre, bars = error_bars(rates.values())
+    axis.errorbar([*rates], centre, bars, fmt="o-", capsize=3, color=PALETTE[0])
     axis.set(xlabel="a pass of the model takes [ms]", ylabel="success [%]", ylim=(-2, 102))
     return figure
 
