@@ -47,22 +47,25 @@ print(sorted(set(heavy.split()) & sys.modules.keys()))
 """
 """A finished training, which says what it imported of what takes long."""
 HELD = """
-import signal, sys, time
-from pipeline.train.loop import Trainer
+import sys, time
+from contextlib import contextmanager
+from pipeline.train import loop
 from stages import train_head
 from stages.command import run
 
-step = Trainer._train_step
+step, deferred, within = loop.Trainer._train_step, loop.deferred_interrupt, []
+@contextmanager
+def watched():
+    with deferred() as interrupted:
+        within.append(interrupted)
+        yield interrupted
 def held(self, batches):
-    step(self, batches)
     if self.step == {step}:
-        both = signal.SIGINT, signal.SIGTERM
-        signal.pthread_sigmask(signal.SIG_BLOCK, both)
         print("holding", flush=True)
-        while not signal.sigpending():
+        while not within[-1]():
             time.sleep(0.01)
-        signal.pthread_sigmask(signal.SIG_UNBLOCK, both)
-Trainer._train_step = held
+    step(self, batches)
+loop.Trainer._train_step, loop.deferred_interrupt = held, watched
 sys.exit(run("", train_head.main, ["--params", sys.argv[1]]))
 """
 """A training that waits after this step until it is stopped."""
