@@ -223,7 +223,7 @@ Memory = TypeVar("Memory", RobotMemory, _Unsent)
 
 
 @dataclass
-class _Episode:
+class _Attempt:
     """An episode of an environment under way; it begins when this is made."""
 
     environment: RobotEnvironment
@@ -272,7 +272,7 @@ class _Episode:
 class _Robot(Generic[Memory]):
     """One episode with its control loop, and why it stopped safely."""
 
-    episode: _Episode
+    episode: _Attempt
     loop: ControlLoop
     memory: Memory
     latency_s: float
@@ -397,7 +397,7 @@ class _Driver(ABC, Generic[Memory]):
         """The demonstrator's episodes; none where the environment has no demonstrator."""
         environment = self.environments[0]
         for seed in seeds:
-            episode = _Episode(environment, seed)
+            episode = _Attempt(environment, seed)
             while not episode.ended:
                 action = environment.expert_action()
                 if action is None:
@@ -415,7 +415,7 @@ class _Driver(ABC, Generic[Memory]):
         reuse, uses_features = (self.metadata[k] for k in ("vlm_reuse_count", "uses_features"))
         return [
             _Robot(
-                _Episode(environment, seed),
+                _Attempt(environment, seed),
                 ControlLoop(self._executor(), reuse, uses_features),
                 self.remember(seed),
                 latency_s,

@@ -35,10 +35,10 @@ from pipeline.base.files import (
 from pipeline.base.source import (
     MOST_GOLDEN,
     SIDES,
-    EpisodePart,
     GoldenRow,
     Side,
     SourceDocument,
+    SplitPart,
     row_key,
 )
 from pipeline.policy.normalization import ChannelStatistics, Normalization
@@ -115,7 +115,7 @@ class PolicyDocument(SourceDocument):
     params: PolicyParams
     shape: PolicyShape
     instructions: Annotated[tuple[Text, ...], Field(max_length=MOST)] = ()
-    split: dict[Side, dict[Text, EpisodePart]]
+    split: dict[Side, dict[Text, SplitPart]]
     weights_sha256: Sha256
     normalization: Normalization
     golden: GoldenDocument | None = None
@@ -187,7 +187,7 @@ class PolicyCheckpoint:
     normalization: Normalization
     source: Mapping[str, Any]
     """Of the store: `feature_spec`, `streams`, `action_hz`, `vlm_reuse_count`."""
-    split: Mapping[Side, Mapping[str, EpisodePart]]
+    split: Mapping[Side, Mapping[str, SplitPart]]
     """The episodes by "source/id": trained on (`train`), chosen on (`val`), never seen (`test`)."""
     step: int
     weights: Mapping[str, "Tensor"]

@@ -44,7 +44,7 @@ from pipeline.base.files import (
     write_document,
 )
 from pipeline.data.lerobot import ACTION, STATE
-from pipeline.data.lerobot_writer import LeRobotEpisode, write_data_set, write_sidecar
+from pipeline.data.lerobot_writer import LeRobotRows, write_data_set, write_sidecar
 from pipeline.data.recording import RECORDINGS
 
 RUN: Final = "run.json"
@@ -387,5 +387,5 @@ def _write_rows(
     digest = np.array([str(metadata.get("feature_spec_digest", ""))])
     used = {"key": rows["key"], "age_s": rows["age_s"]}
     write_sidecar(root, "features", used | {"feature_spec_digest": digest})
-    episode = LeRobotEpisode(columns, images=images)
+    episode = LeRobotRows(columns, images=images)
     write_data_set(root, [episode], features, run.instruction, metadata["action_hz"])

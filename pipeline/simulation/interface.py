@@ -27,7 +27,7 @@ class EnvironmentRobot:
     level: str
     """What tables call its episodes: a task, or how hard it is."""
     instruction: str
-    """What the robot is told."""
+    """The prompt of the policy."""
     hz: float
     """Control steps in a second."""
     action: Channels

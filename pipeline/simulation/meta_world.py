@@ -52,7 +52,7 @@ def full_name(task: str) -> str:
 
 
 def instruction_of(task: str) -> str:
-    """What the robot is told: one plain sentence."""
+    """The instruction: one plain sentence."""
     name = full_name(task)
     words = name.removesuffix("-v3").replace("-", " ")
     return INSTRUCTIONS.get(name, f"{words.capitalize()}.")

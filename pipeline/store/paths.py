@@ -74,7 +74,7 @@ def is_store(path: Path) -> bool:
 
 
 STORE = OutputKind("a feature store", is_store)
-KEPT = OutputKind("a store of before, kept for its rows,")
+KEPT = OutputKind("an earlier store, kept for its rows,")
 """The previous store, known by its marker; a user's copy has no marker.
 
 The name must not change: markers of earlier versions contain it.
