@@ -7,6 +7,7 @@ import re
 import select
 import signal
 import sys
+import time
 from collections.abc import Callable, Generator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -144,6 +145,8 @@ def _run(
             repeated = [pair for shorthand in again for pair in shorthand.override(options)]
             with running_with(options.params, [*options.overrides, *repeated]):
                 work(params)
+            if os.environ.get("DVC_STAGE"):
+                _print_times()
         sys.stdout.flush()  # here, where an error is handled: at the interpreter's exit it is not
     except PipelineError as error:
         message = str(error)
@@ -158,6 +161,18 @@ def _run(
         return 0
     print(f"error: {message}", file=sys.stderr)
     return 2
+
+
+def _print_times() -> None:
+    """Print how long this stage of a DVC run took, and how long the run has taken so far."""
+    import psutil
+
+    from pipeline.base.text import duration
+
+    stage, now = psutil.Process(), time.time()
+    runs = [p for p in stage.parents() if any(Path(w).name == "dvc" for w in p.cmdline()[:3])]
+    so_far = f", {duration(now - runs[0].create_time())} since dvc began" if runs else ""
+    print(f"{os.environ['DVC_STAGE']} took {duration(now - stage.create_time())}{so_far}")
 
 
 @contextmanager
