@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from pipeline.base.border import Border, Document
+from pipeline.base.documents import Border, Document
 from pipeline.base.errors import ConfigError
 from pipeline.base.files import OutputKind, replace_folder, there, write_document
 from pipeline.data.lerobot_writer import LeRobotRows, write_data_set

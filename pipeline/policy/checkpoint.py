@@ -17,10 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, field_validator, model_validator
 
-from pipeline.base.border import Document, Text, shown
 from pipeline.base.config import TrainHeadParams
 from pipeline.base.config.section import Section
 from pipeline.base.differences import describe, differences
+from pipeline.base.documents import Document, Text, shown
 from pipeline.base.errors import CheckpointIncomplete, CheckpointMismatch, PipelineError
 from pipeline.base.files import (
     RUN_FILES,
@@ -32,7 +32,7 @@ from pipeline.base.files import (
     write_tensors,
     write_with_digest,
 )
-from pipeline.base.source import (
+from pipeline.base.provenance import (
     MOST_GOLDEN,
     SIDES,
     GoldenRow,

@@ -32,7 +32,7 @@ from numpy.typing import ArrayLike, NDArray
 from pydantic import ConfigDict
 
 from pipeline.base.arrays import non_finite
-from pipeline.base.border import Document, Text
+from pipeline.base.documents import Document, Text
 from pipeline.base.errors import DiskFull, RecordingError
 from pipeline.base.files import (
     FULL,

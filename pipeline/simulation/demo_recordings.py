@@ -20,8 +20,8 @@ import numpy as np
 from tqdm import tqdm
 
 from pipeline.base import files
-from pipeline.base.border import Border, Document, Text
 from pipeline.base.digests import joint_digest
+from pipeline.base.documents import Border, Document, Text
 from pipeline.base.errors import ConfigError
 from pipeline.base.files import OutputKind, recover_folder, replace_folder, write_document
 from pipeline.simulation.insertion_formats import (

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from pipeline.simulation.arm import robot_state
 from pipeline.simulation.insertion import ENCODER_NOISE, INSERTED, STATE_HZ, NeedleInsertion
-from pipeline.simulation.layout import WORKSPACE_MM, InsertionLayout, draw_layout
+from pipeline.simulation.insertion_layout import WORKSPACE_MM, InsertionLayout, draw_layout
 from pipeline.simulation.needle_sensor import READING_HZ
 from pipeline.simulation.rendering import photograph
 

@@ -19,10 +19,10 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from pipeline.base.commands import command
 from pipeline.base.differences import describe, differences
 from pipeline.base.errors import ConfigError, StoreMismatch
-from pipeline.base.source import (
+from pipeline.base.printed_commands import command
+from pipeline.base.provenance import (
     RATE_TOLERANCE,
     join_tuned_on,
     spread,
@@ -37,7 +37,7 @@ from pipeline.store.chunks import (
     read_rows,
 )
 from pipeline.store.episodes import Episode, index_arrays
-from pipeline.store.golden import GOLDEN, GoldenFrames, read_golden
+from pipeline.store.golden_rows import GOLDEN, GoldenFrames, read_golden
 from pipeline.store.lock import build_lock
 from pipeline.store.paths import (
     MERGED,

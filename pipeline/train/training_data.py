@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.base.commands import command
 from pipeline.base.differences import describe, differences
 from pipeline.base.errors import CheckpointMismatch, ConfigError
-from pipeline.base.source import SIDES, Side, SplitPart, TunedPart, tuned_on_of_store
+from pipeline.base.printed_commands import command
+from pipeline.base.provenance import SIDES, Side, SplitPart, TunedPart, tuned_on_of_store
 from pipeline.policy.checkpoint import SOURCE_KEYS, PolicyCheckpoint
 from pipeline.store import Episode, FeatureStore, episode_name
 from pipeline.train.split import Split, ticks_of

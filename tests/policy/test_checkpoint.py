@@ -19,7 +19,7 @@ from pipeline.base.files import (
     write_tensors,
     write_with_digest,
 )
-from pipeline.base.source import SplitPart
+from pipeline.base.provenance import SplitPart
 from pipeline.policy.checkpoint import (
     PolicyCheckpoint,
     check_policy,

@@ -17,8 +17,8 @@ from pipeline.compat.unified import no_normalization
 from pipeline.policy.checkpoint import PolicyCheckpoint, find_policy, load_policy
 from pipeline.policy.observation import PolicyShape
 from pipeline.policy.policy import Policy
-from pipeline.robot import process
-from pipeline.robot.process import PolicyThread
+from pipeline.robot import loop_process
+from pipeline.robot.loop_process import PolicyThread
 from pipeline.robot.server import PolicyServer, listen
 from pipeline.robot.session import ServedPolicy
 from pipeline.simulation.insertion import INSTRUCTION
@@ -120,11 +120,13 @@ class SimulatedThread(PolicyThread):
         self.busy = True
         self._answer(question)
         policy = getattr(self._infer, "__self__", None)
-        self._due_s = process.time.monotonic() + getattr(policy, "latency_s", 0.0)
+        self._due_s = loop_process.time.monotonic() + getattr(policy, "latency_s", 0.0)
 
     def take(self) -> Mapping[str, Any] | None:
         return (
-            super().take() if self.busy and process.time.monotonic() >= self._due_s - 1e-9 else None
+            super().take()
+            if self.busy and loop_process.time.monotonic() >= self._due_s - 1e-9
+            else None
         )
 
 

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.store import mapping
-from pipeline.store.mapping import fitting, map_flat, populate, read_at_random, will_need
+from pipeline.store import memory_map
+from pipeline.store.memory_map import fitting, map_flat, populate, read_at_random, will_need
 
 PAGE = mmap.PAGESIZE
 ROWS, CHUNK = 4096, 1024
@@ -69,7 +69,7 @@ def test_a_kernel_that_cannot_populate_is_asked_to_read(mapped, values, monkeypa
         ctypes.set_errno(errno.EINVAL)
         return -1 if advice == 22 else 0
 
-    monkeypatch.setattr(mapping._LIBC, "madvise", madvise)
+    monkeypatch.setattr(memory_map._LIBC, "madvise", madvise)
     populate(mapped)
     assert asked == [22, mmap.MADV_WILLNEED]
 
@@ -82,13 +82,13 @@ def test_a_file_cut_short_is_an_error_and_no_signal(mapped, tmp_path):
 
 def test_advice_covers_the_rows_and_nothing_beyond_the_map(mapped, values, monkeypatch):
     seen = []
-    real = mapping._LIBC.madvise
+    real = memory_map._LIBC.madvise
 
     def madvise(address: int, length: int, advice: int) -> int:
         seen.append((address - mapped.ctypes.data, length, advice))
         return real(address, length, advice)
 
-    monkeypatch.setattr(mapping._LIBC, "madvise", madvise)
+    monkeypatch.setattr(memory_map._LIBC, "madvise", madvise)
     will_need(mapped, np.array([4000, -6, 130, 130]), 128)
     assert [advice for *_, advice in seen] == [mmap.MADV_WILLNEED] * 3
     for (start, length, _), (first, last) in zip(

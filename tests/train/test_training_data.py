@@ -9,7 +9,7 @@ import pytest
 
 from pipeline.base.config import SplitParams
 from pipeline.base.errors import CheckpointMismatch
-from pipeline.base.source import SIDES, SplitPart
+from pipeline.base.provenance import SIDES, SplitPart
 from pipeline.store import FeatureStore
 from pipeline.train.split import split_by_episode
 from pipeline.train.training_data import find_ticks, groups_of, split_parts

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from pipeline.base.config import Params, VLMParams
 from pipeline.base.errors import PipelineError, RecordingError
-from pipeline.base.source import CLOCK_SLACK_S
+from pipeline.base.provenance import CLOCK_SLACK_S
 from pipeline.base.text import Table
 from pipeline.look.page.blocks import Block, Text, TokenRun, Tokens
 from pipeline.look.page.style import INK, draw_frame, panels

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import AfterValidator, Field, Strict, model_validator
 
-from pipeline.base.border import Border, Document, Text
+from pipeline.base.documents import Border, Document, Text
 from pipeline.base.errors import StoreIncomplete
 from pipeline.base.files import read_document, write_with_digest
 
