@@ -12,6 +12,7 @@ import json
 import logging
 import math
 import os
+import re
 import signal
 import socket
 import sys
@@ -32,6 +33,7 @@ from websockets.frames import CloseCode
 from websockets.http11 import Request, Response
 
 from pipeline.base.config import ServeParams
+from pipeline.base.documents import shown
 from pipeline.base.errors import ConfigError, ObservationError, PipelineError, WireError
 from pipeline.robot import wire
 from pipeline.robot.client import TOKEN_VARIABLE
@@ -336,6 +338,9 @@ class PolicyServer:
             return respond(HTTPStatus.OK, "OK")
         if "Origin" in request.headers:
             return respond(HTTPStatus.FORBIDDEN, "web pages are not served")
+        if self._token is None and not _is_loopback(name := _host(request)):
+            why = f"expected Host localhost, found {shown(name)}: other names need a token"
+            return respond(HTTPStatus.FORBIDDEN, why)
         if not self._is_authorized(request):
             why = "expected the header Authorization: Api-Key <the server's token>"
             return respond(HTTPStatus.UNAUTHORIZED, why)
@@ -354,6 +359,12 @@ class PolicyServer:
             return True
         given = ",".join(request.headers.get_all("Authorization")).encode(errors="replace")
         return hmac.compare_digest(given, f"Api-Key {self._token}".encode())
+
+
+def _host(request: Request) -> str:
+    """The name in `Host`, which a web page can make to point to this machine."""
+    named = re.fullmatch(r"\[?(.*?)\]?(:\d+)?", ",".join(request.headers.get_all("Host")))
+    return named[1] if named else ""
 
 
 def _address(connection: ServerConnection) -> str:

@@ -225,6 +225,9 @@ def test_web_pages_are_refused(served_policy, serving) -> None:
     for origin in ("null", f"http://{server.address}"):
         for path in ("/", "/status.json"):
             assert get(server, path, Origin=origin)[0] == 403
+    # Names that a page made to point here; http.client sends the right one unasked.
+    for host, status in (("elsewhere.org:80", 403), ("[::1]:80", 200), ("localhost", 200)):
+        assert get(server, "/status.json", Host=host)[0] == status
     with pytest.raises(InvalidStatus, match="403"), opened(server, origin="https://example.org"):
         pass
     assert get(server, "/elsewhere")[0] == 404
