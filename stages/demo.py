@@ -23,12 +23,12 @@ SECTIONS = ("demo",)
 
 def main(params: "Params") -> None:
     """Write the recordings under `demo.recordings` and the checkpoint at `demo.checkpoint`."""
-    from pipeline.base.files import refuse_foreign
+    from pipeline.base.files import recover_folder
     from pipeline.simulation.demo_recordings import DEMO, replace_demo, write_demo_recordings
     from pipeline.vlm.demo_checkpoint import write_checkpoint_files
 
     demo = params.demo
-    refuse_foreign(demo.checkpoint, DEMO)
+    recover_folder(demo.checkpoint, DEMO)
     write_demo_recordings(demo.recordings, demo.episodes, demo.seed)
     write = partial(write_checkpoint_files, seed=demo.seed)
     replace_demo(demo.checkpoint, {"seed": demo.seed}, write)

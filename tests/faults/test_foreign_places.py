@@ -21,8 +21,8 @@ WRITERS: dict[str, tuple[str, str, tuple[str, ...]]] = {
     "ledger": ("stages.extract", "x.zarr.files.sqlite", ("extract.store={tmp}/x.zarr",)),
     "lost": ("stages.extract", "stores/made.zarr.previous", (PRESS,)),
     "recordings": ("stages.demo", "demo", ("demo.recordings={}",)),
-    "checkpoint": ("stages.demo", "vlm", ("demo.checkpoint={}",)),
-    "new": ("stages.demo", "vlm.new", ("demo.checkpoint={tmp}/vlm",)),
+    "checkpoint": ("stages.demo", "vlm", ("demo.checkpoint={}", "demo.recordings={tmp}/demo")),
+    "new": ("stages.demo", "vlm.new", ("demo.checkpoint={tmp}/vlm", "demo.recordings={tmp}/demo")),
     "merge": ("stages.store", "x.zarr", ("stores.output={}",)),
     "merge build": ("stages.store", "x.zarr.part", ("stores.output={tmp}/x.zarr",)),
     "archive": ("stages.archive", "x.zarr", ("archive.output={}",)),
@@ -95,6 +95,7 @@ def test_is_left_as_it_is(writer, foreign, params, here, tmp_path):
     code, _, complained = here(command, params, *(w for one in options for w in ("--set", one)))
     assert code == 2, complained
     assert str(place) in complained
+    assert not (tmp_path / "demo" / "raw").exists(), "the work begins before the refusal"
     assert "Traceback" not in complained
     assert (place.read_bytes() if foreign == "file" else content(place)) == before
 
