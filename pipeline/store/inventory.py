@@ -206,8 +206,10 @@ def _spec(entry: StoreEntry) -> tuple[str, str]:
         f"{slot.pooling} of {'the vision tower' if slot.layer == 'vision' else slot.layer}"
         for slot in entry.attributes.slots
     ]
+    pca = entry.attributes.feature_spec.pca
+    dim = packed_dim(features.stored_dtype, features.shape[2])
+    width = f"{dim} (PCA of {pca.of})" if pca else f"{dim}"
     return entry.attributes.feature_spec.digest[:8], (
-        f"{features.shape[1]} slots x {packed_dim(features.stored_dtype, features.shape[2])} in "
-        f"{features.stored_dtype}, {' + '.join(dict.fromkeys(slots))}, prompt "
-        f"{document.get('prompt')}"
+        f"{features.shape[1]} slots x {width} in {features.stored_dtype}, "
+        f"{' + '.join(dict.fromkeys(slots))}, prompt {document.get('prompt')}"
     )

@@ -12,7 +12,7 @@ import torch
 from tqdm import tqdm
 
 from pipeline.base.config import TrainHeadParams
-from pipeline.base.text import duration
+from pipeline.base.text import duration, size
 from pipeline.policy.observation import PolicyShape
 from pipeline.store import FeatureStore
 from pipeline.train.batches import Prefetch
@@ -125,6 +125,11 @@ def describe_data(
         f"split: {len(split.train)} training ticks, {len(split.val)} val, {len(split.test)} test "
         f"of {' + '.join(str(len(names)) for names in groups)} groups{cut}",
     ]
+    if store.basis is not None:
+        lines.append(
+            f"features are on {dim} main directions of {store.spec['pca']['of']} numbers; the "
+            f"checkpoint carries their basis, {size(store.basis.maps.nbytes)}"
+        )
     if (dtype := store.spec.get("storage_dtype")) in ("int8", "float8"):
         lines.append(
             f"features are stored in {dtype}; stages.probe with probe.codecs on a store in float32 "

@@ -26,9 +26,11 @@ from pipeline.base.config.policy_use import (
     latencies_ms,
 )
 from pipeline.base.config.stage_one import (
+    PCA,
     AugmentationParams,
     DataParams,
     ExtractParams,
+    FeatureDtype,
     GridPooling,
     InspectParams,
     Layer,
@@ -38,6 +40,7 @@ from pipeline.base.config.stage_one import (
     Source,
     StoresParams,
     VLMParams,
+    stored_as,
 )
 from pipeline.base.config.training import (
     DiffusionParams,

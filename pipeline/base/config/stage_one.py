@@ -25,6 +25,29 @@ Layer = int | Literal["vision"]
 """Index of a decoder layer, or the vision tower."""
 
 
+class PCA(Section):
+    """Fewer numbers a slot: its coefficients on the main directions of some of the features."""
+
+    pca: int = Field(ge=1, le=65_536)
+    """How many; at most the width of the model's hidden states."""
+    then: StorageDtype = "int8"
+    """The type in which they are stored."""
+
+    def __str__(self) -> str:
+        return f"pca {self.pca} in {self.then}"
+
+
+FeatureDtype = Annotated[
+    Annotated[StorageDtype, Tag("name")] | Annotated[PCA, Tag("pca")],
+    Discriminator(lambda value: "name" if isinstance(value, str) else "pca"),
+]
+
+
+def stored_as(dtype: StorageDtype | PCA) -> StorageDtype:
+    """The type of the numbers that are stored."""
+    return dtype.then if isinstance(dtype, PCA) else dtype
+
+
 class GridPooling(Section):
     """A grid of its own size, so that several stand side by side."""
 
@@ -214,9 +237,10 @@ class ExtractParams(Section):
 
     store: Output = Path("cache_store/demo.zarr")
     """The store, whose name ends in .zarr; written once, then never modified."""
-    dtype: StorageDtype = "float32"
+    dtype: FeatureDtype = "float32"
     """Type of the stored features. float8 and int8 take a quarter of float32, with scales of their
-    own; stages.probe with `probe.codecs` says what each loses."""
+    own. `{pca: 128, then: int8}` keeps 128 numbers a slot, on the main directions of a sample of
+    rows, in int8. stages.probe with `probe.codecs` says what each loses."""
     sensor_dtype: Literal["float32", "float16"] = "float32"
     """Type of the stored sensor stream."""
     batch_size: Literal["auto"] | Annotated[int, Field(ge=1, le=10_000)] = "auto"
@@ -325,7 +349,7 @@ class ProbeParams(Section):
     """Sensor readings before the tick; their mean, last value and spread are the inputs."""
     state_window: int = Field(default=100, ge=1, le=20_000)
     """State readings before the tick, used in the same way."""
-    codecs: tuple[StorageDtype, ...] = ()
+    codecs: tuple[FeatureDtype, ...] = ()
     """Also say what these values of `extract.dtype` would lose: the error of the numbers, and the
     difference in R2. Run it on a store in float32."""
     threads: int = Field(default=2, ge=1, le=256)

@@ -1,0 +1,80 @@
+"""The basis of a new store: fitted on a sample of its rows before any of them is written."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+from tqdm import tqdm
+
+from pipeline.base.projection import Basis, fit_map, group_sizes
+from pipeline.data.episode import RowFrames
+from pipeline.extract.encoder import Encoder
+from pipeline.extract.rows import ReadyRow, RowPreparation
+from pipeline.extract.survey import CheckedEpisode, Survey
+from pipeline.store.episodes import episode_arrays
+from pipeline.vlm.qwen import FrozenVLM
+
+SAMPLE_ROWS = 1024
+"""Most rows of the sample."""
+_SLOTS_A_ROW = 4
+"""Most slots of a group that a row of the sample gives, the next ones of the next row."""
+_BATCH = 8
+"""Not the fastest size: with another one every time, the basis would not have the same bits."""
+
+
+def fit_basis(surveyed: Survey, checked: Sequence[CheckedEpisode]) -> tuple[Basis, str]:
+    """The basis of the projected features of these episodes, and a line for people about it.
+
+    Rows are evenly spread over all episodes. Raises what decoding and the model raise.
+    """
+    spec = surveyed.spec.whole
+    assert spec is not None, "only projected features have a basis"
+    whole = replace(spec, document=spec.document | {"storage_dtype": "float32"}, variants=1)
+    raw = replace(surveyed, spec=whole, vlm=surveyed.vlm.model_copy(update={"variants": 1}))
+    times = episode_arrays(checked, [source.name for source in raw.data.sources], whole.views)
+    vl_start, frame_time = times["episode/vl_start"], times["vl/frame_time"]
+    count = min(SAMPLE_ROWS, len(frame_time))
+    rows = np.arange(count, dtype=np.int64) * len(frame_time) // count
+    frames = RowFrames(raw.recordings, vl_start, frame_time, whole.views)
+    preparation = RowPreparation(raw, ())
+    ready = (
+        row
+        for part in frames.ranges(rows, _BATCH)
+        for row in preparation.prepare(part)
+        if isinstance(row, ReadyRow)  # all: no other store is known
+    )
+    sample = _Sample(group_sizes(whole.document["slots"]))
+    vlm = FrozenVLM.load(raw.vlm, whole, raw.extract.device)
+    with tqdm(None, "fit the basis", count, unit="row", disable=None) as bar:
+        for batch, features in Encoder(vlm, _BATCH).encoded(ready):
+            for row, values in zip(batch, features, strict=True):
+                sample.add(int(np.searchsorted(rows, row.row)), values)
+            bar.update(len(batch))
+    fitted = [fit_map(sample.values(group), surveyed.spec.dim) for group in sample.groups]
+    least = min(share for _, share in fitted)
+    return Basis(np.stack([affine for affine, _ in fitted])), (
+        f"basis of {surveyed.spec.dim} of {whole.dim} numbers a slot, fitted on {count} rows: "
+        f"keeps {least:.1%} or more of the variance of standardised channels"
+    )
+
+
+class _Sample:
+    """Some features of each group of slots, in the order of their rows."""
+
+    def __init__(self, sizes: Sequence[int]) -> None:
+        self.groups = range(len(sizes))
+        self._sizes = sizes
+        self._starts = np.cumsum([0, *sizes])
+        self._kept: list[dict[int, NDArray[np.float32]]] = [{} for _ in sizes]
+
+    def add(self, number: int, values: NDArray[np.float32]) -> None:
+        """Keep some slots of the features (slot, channel) of the sample's row of this number."""
+        for group, size in enumerate(self._sizes):
+            turn = np.arange(min(size, _SLOTS_A_ROW)) + number * _SLOTS_A_ROW
+            chosen = values[self._starts[group] + turn % size]
+            self._kept[group][number] = chosen[chosen.any(axis=1)]  # zeros are of missing views
+
+    def values(self, group: int) -> NDArray[np.float32]:
+        """The features (row, channel) of a group."""
+        return np.concatenate([kept for _, kept in sorted(self._kept[group].items())])
