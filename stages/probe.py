@@ -9,7 +9,8 @@ and a page (report.html) into probe.output.
   python -m stages.probe                             as params.yaml stands
   python -m stages.probe --set probe.max_ticks=2000  that many ticks, evenly spread: a first look
 
-  python -m stages.probe --set 'probe.codecs=[float16, int8]'  and what fewer bytes would lose
+  python -m stages.probe --set 'probe.codecs=[int8, {pca: 128, then: int8}]'
+                                                     and what fewer bytes would lose
 
 You can also --set probe.output (where the files go), probe.folds (groups of recordings, each
 predicted from the others), probe.repeats (how often these are dealt) and probe.horizon (ticks of
@@ -33,10 +34,11 @@ def main(params: "Params") -> None:
     """Probe the store that `probe` names."""
     from pipeline.base.files import REPORT, claim, refuse_foreign
     from pipeline.evaluate.probe.study import probe
-    from pipeline.evaluate.probe.tables import advice, table, write_tables
+    from pipeline.evaluate.probe.tables import advice, proofs, table, write_tables
     from pipeline.look.page.writing import write_report
     from pipeline.look.probe import probe_report
     from pipeline.store import FeatureStore, check_trailers
+    from pipeline.store.proofs import write_proofs
 
     wanted = params.probe
     refuse_foreign(wanted.output, REPORT)
@@ -47,6 +49,9 @@ def main(params: "Params") -> None:
         check_trailers(store.path)
     study = probe(store, wanted)
     claim(wanted.output, REPORT)
+    if study.codecs:
+        kept = write_proofs(store.path, store.spec, proofs(study))
+        print(f"{kept}: what these types lose, for extractions of the same features beside it")
     files = [
         *write_tables(wanted.output, study),
         *write_report(wanted.output, probe_report(study, store.path.name)),

@@ -18,8 +18,9 @@ from numpy.typing import NDArray
 
 _LEAST_SPREAD = 1e-3
 """A share of a channel's size: a smaller spread may be rounding, which is not made larger."""
-_LEAST_VARIANCE = 1e-2
-"""A share of a channel's variance: directions of less are not made larger than that allows."""
+_LEAST_VARIANCE = 0.1
+"""A share of a channel's variance: directions of less, and the model's noise in them, are not made
+larger than that allows."""
 
 
 @dataclass(frozen=True, eq=False)

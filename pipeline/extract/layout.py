@@ -22,6 +22,7 @@ from pipeline.extract.state import store_bytes
 from pipeline.extract.survey import CheckedEpisode, Survey, embodiment_of
 from pipeline.store import FEATURES, SCHEMA, RowSource, Sizes, StoreBuild, arrays
 from pipeline.store.episodes import episode_arrays
+from pipeline.store.proofs import PROOF, find_proof
 from pipeline.store.schema import BASIS, MOST_ROW_BYTES, ArraySpec
 from pipeline.vlm.checkpoint_folder import tuned_on
 from pipeline.vlm.feature_spec import FeatureSpec
@@ -164,5 +165,12 @@ def _attributes(checked: Sequence[CheckedEpisode], survey: Survey) -> dict[str, 
         "action_hz": tick_hz((episode.ticks.recorded_hz for episode in checked), data.action_hz),
         "vlm_reuse_count": data.vlm_reuse_count,
         "environment": [],
+        **_proof(survey),
         **tuned_on_attributes(tuned_on(survey.vlm)),
     }
+
+
+def _proof(survey: Survey) -> dict[str, Any]:
+    """The attribute with what a probe found that this type of storage loses, if one did."""
+    proof = find_proof(survey.target.parent, survey.spec.document)
+    return {} if proof is None else {PROOF: proof.model_dump(mode="json")}

@@ -18,6 +18,7 @@ from pipeline.store import FeatureStore, part_path
 from pipeline.store.archive import archive, restore
 from pipeline.store.chunks import read_rows
 from pipeline.store.merging import merge
+from pipeline.store.proofs import Loss, Proof, proof_of, write_proofs
 from pipeline.store.schema import BASIS, read_spec
 from pipeline.store.verification import verify
 
@@ -35,12 +36,16 @@ def projected(changed, extracted, tmp_path):
 
 def test_rows_are_the_projected_features(projected):
     params, whole = projected
+    loss = Loss(of="layer 3, mean", r2=-0.01, error_std=0.02)
+    proof = Proof(recordings=3, ticks=60, losses=[loss])
+    write_proofs(whole.path, whole.spec, {"pca 24 in int8": proof})
     report, lines = run(params)
     store = FeatureStore.open(params.extract.store)
     assert report.computed == len(whole.array("vl/time"))
     assert any(line.startswith("basis of 24 of 128 numbers a slot") for line in lines)
     assert store.feature_shape == (whole.feature_shape[0], 24)
     assert verify(store.path).sound
+    assert proof_of(store.attrs) == proof
     values, full = widen(store.array("vl/features")), whole.array("vl/features")
     valid = whole.array("vl/slot_valid").astype(bool)
     group = [0, 1, 2, 2]  # mean, image_mean, and view_mean of two views

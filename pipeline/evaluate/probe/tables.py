@@ -9,6 +9,7 @@ import numpy as np
 from pipeline.base.files import write_document
 from pipeline.base.text import Table
 from pipeline.evaluate.probe.study import ProbeResult, ProbeStudy, ranked, recommend
+from pipeline.store.proofs import Loss, Proof
 
 TOP = 12
 """The most slots that are printed; the tables have all."""
@@ -98,6 +99,23 @@ def codec_table(study: ProbeStudy) -> Table:
     ]
     heads = ["extract.dtype", "what is read", "R2 minus stored", "error [std]", "bytes a row"]
     return Table(heads, rows)
+
+
+def proofs(study: ProbeStudy) -> dict[str, Proof]:
+    """The verdict on each codec, for the file beside the store."""
+    losses: dict[str, list[Loss]] = {}
+    for result in study.codecs:
+        figure = result.difference
+        loss = Loss(
+            of=result.of.name.label,
+            r2=figure.value,
+            low=figure.low,
+            high=figure.high,
+            error_std=result.error,
+        )
+        losses.setdefault(result.codec, []).append(loss)
+    of = {"recordings": study.folds.recordings, "ticks": len(study.folds.ticks)}
+    return {codec: Proof(**of, losses=own) for codec, own in losses.items()}
 
 
 def notes(study: ProbeStudy) -> list[str]:
