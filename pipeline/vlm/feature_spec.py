@@ -40,6 +40,8 @@ AUGMENTATION_VERSION = 1
 _WIDTH_OF_3B = 2048
 """Width of the hidden states of Qwen2.5-VL-3B."""
 
+_LAYERS_OF_3B = 36
+
 _MANY_LAYERS = 10_000
 """A stand-in for an unknown number of layers, on which the number of slots does not depend."""
 
@@ -156,7 +158,7 @@ def dtype_of(spec: Mapping[str, Any]) -> FeatureDtype:
 
 
 def feature_shape(vlm: VLMParams, views: Sequence[str]) -> tuple[int, int]:
-    """(slots, width) of the features; for a hub id the width is that of Qwen2.5-VL-3B.
+    """(slots, width) of the features; for a hub id width and layers are those of Qwen2.5-VL-3B.
 
     Raises `VLMError` for a checkpoint that is neither a folder nor a hub id, also for a name whose
     parent is a folder here but that does not exist.
@@ -167,9 +169,11 @@ def feature_shape(vlm: VLMParams, views: Sequence[str]) -> tuple[int, int]:
         from pipeline.vlm.processor import PixelSettings
 
         tokens = PixelSettings.of(vlm).merged_grid
-    slots = len(slots_of(vlm, _MANY_LAYERS, views, tokens))
-    if folder:
-        return slots, read_config(folder).text_config.hidden_size
+    text = read_config(folder).text_config if folder else None
+    every = text.num_hidden_layers if text else _LAYERS_OF_3B
+    slots = len(slots_of(vlm, every if vlm.layers == "all" else _MANY_LAYERS, views, tokens))
+    if text:
+        return slots, text.hidden_size
     if folder_here(str(Path(vlm.checkpoint).parent)) or not could_be_hub_id(vlm.checkpoint):
         raise VLMError(
             f"{vlm.checkpoint}: no such folder, and no hub id. The demo's checkpoint is written by "

@@ -134,3 +134,11 @@ def test_what_a_type_would_lose_is_kept_beside_the_store(
     assert [loss.of for loss in proof.losses] == ["layer 3, mean", "layer 3, grid"]
     few = spec | {"storage_dtype": "int8", "dim": 4, "pca": {"of": 8, "basis": "any"}}
     assert find_proof(params.parent, few) is not None
+
+
+def test_without_the_model_passes_are_not_timed(
+    params: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run("", probe.main, ["--params", str(params), "--set", "probe.time=true"]) == 0
+    assert "not timed: " in (said := capsys.readouterr().out)
+    assert "s a pass" not in said

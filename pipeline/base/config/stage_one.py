@@ -25,6 +25,14 @@ Layer = int | Literal["vision"]
 """Index of a decoder layer, or the vision tower."""
 
 
+Layers = Annotated[
+    Annotated[Literal["all"], Tag("all")]
+    | Annotated[tuple[Layer, ...], Field(min_length=1, max_length=1000), Tag("some")],
+    Discriminator(lambda value: "all" if isinstance(value, str) else "some"),
+]
+"""Some layers, or every decoder layer."""
+
+
 class PCA(Section):
     """Fewer numbers a slot: its coefficients on the main directions of some of the features."""
 
@@ -205,9 +213,9 @@ class VLMParams(Section):
     """Pixels; rounded to a size that the processor accepts (640 -> 644)."""
     prompt: str = "{instruction}\n{images}\n{instruction}"
     """Template of one user turn. Attention is causal: images see only the text before them."""
-    layers: tuple[Layer, ...] = Field(default=(-1,), min_length=1, max_length=1000)
-    """Decoder layers whose output is taken; 0 is the first, -1 the last. vision: the output of the
-    vision tower; alone, the language model does not run."""
+    layers: Layers = (-1,)
+    """Decoder layers whose output is taken; 0 is the first, -1 the last; or all. vision: the output
+    of the vision tower; alone, the language model does not run."""
     norms: tuple[bool, ...] = Field(default=(True,), min_length=1, max_length=2)
     """Whether the model's final norm is applied to a layer's output; [true, false] stores both."""
     pooling: tuple[Pooling, ...] = Field(default=("mean", "grid"), min_length=1, max_length=16)
@@ -352,6 +360,8 @@ class ProbeParams(Section):
     codecs: tuple[FeatureDtype, ...] = ()
     """Also say what these values of `extract.dtype` would lose: the error of the numbers, and the
     difference in R2. Run it on a store in float32."""
+    time: bool = False
+    """Also load the model of `vlm` and say how long a pass takes that stops after each layer."""
     threads: int = Field(default=2, ge=1, le=256)
     """Threads, each of which works on its own slot."""
     check_store: bool = True

@@ -1,8 +1,8 @@
 """Every slot and group of slots, scored by a linear regression from it to the action chunk."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
@@ -102,6 +102,8 @@ class ProbeStudy:
     """In the store's order; of many hundred slots only those that are a group of their own."""
     groups: tuple[ProbeResult, ...]
     codecs: tuple[CodecResult, ...] = ()
+    seconds: Mapping[int, float] = field(default_factory=dict)
+    """Depth (`depth`) -> s of a pass of one row that stops there; empty where not measured."""
 
     @property
     def baseline(self) -> Known:

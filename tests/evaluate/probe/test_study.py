@@ -86,6 +86,10 @@ def test_a_codec_is_judged_by_its_error_and_by_what_it_costs(
         probed(store, codecs=({"pca": 9},))
     assert metrics(study)["codecs"][study.groups[0].name.label]["int8"]["row_bytes"] == 50
     assert "R2 minus stored" in table(study)
+    assert "s a pass" not in table(study)
+    timed = replace(study, seconds={0: 0.0123})
+    assert "s a pass" in table(timed) and "0.0123" in table(timed)
+    assert metrics(timed)["pass_s"] == {"0": 0.0123}
 
 
 @pytest.fixture
