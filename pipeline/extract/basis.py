@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from pipeline.base.projection import Basis, fit_map, group_sizes
+from pipeline.base.projection import Basis, fit_map
 from pipeline.data.episode import RowFrames
 from pipeline.extract.encoder import Encoder
 from pipeline.extract.rows import ReadyRow, RowPreparation
@@ -44,7 +44,7 @@ def fit_basis(surveyed: Survey, checked: Sequence[CheckedEpisode]) -> tuple[Basi
         for row in preparation.prepare(part)
         if isinstance(row, ReadyRow)  # all: no other store is known
     )
-    sample = _Sample(group_sizes(whole.document["slots"]))
+    sample = _Sample(whole.groups)
     vlm = FrozenVLM.load(raw.vlm, whole, raw.extract.device)
     with tqdm(None, "fit the basis", count, unit="row", disable=None) as bar:
         for batch, features in Encoder(vlm, _BATCH).encoded(ready):

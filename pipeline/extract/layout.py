@@ -13,7 +13,6 @@ from pipeline.base.arrays import first_non_finite
 from pipeline.base.config import stored_as
 from pipeline.base.errors import ConfigError, DiskFull, NumericsError
 from pipeline.base.files import free_bytes
-from pipeline.base.projection import group_sizes
 from pipeline.base.source import tuned_on_attributes
 from pipeline.base.text import size
 from pipeline.data import Stream
@@ -90,7 +89,7 @@ def build_arrays(checked: Sequence[CheckedEpisode], survey: Survey) -> dict[str,
         action_dim=len(embodiment.action.names),
         channel=len(embodiment.sensor.names),
         state_dim=len(embodiment.state.names),
-        group=0 if whole is None else len(group_sizes(whole.document["slots"])),
+        group=0 if whole is None else len(whole.groups),
         input=0 if whole is None else whole.dim + 1,
     )
     specs = arrays(sizes, stored_as(extract.dtype), extract.sensor_dtype)

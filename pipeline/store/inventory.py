@@ -30,6 +30,7 @@ from pipeline.store.paths import (
     laid_out_attributes,
     recover,
 )
+from pipeline.store.proofs import proof_of
 from pipeline.store.reader import FeatureStore
 from pipeline.store.schema import CHECKSUMS, FEATURES, ArraySpec, read_spec, read_specs
 
@@ -194,6 +195,8 @@ def _details(entry: StoreEntry) -> Iterator[str]:
     if entry.damage:
         # What is wrong, without the advice after it.
         yield f"damaged: {entry.damage.split('. ', 1)[0].splitlines()[0]}"
+    if entry.attributes and (proof := proof_of(entry.attributes.raw)):
+        yield f"as it is stored, {proof}"
     if entry.kind == "build" and is_locked(entry.base):
         yield "being built"
 

@@ -18,7 +18,7 @@ from pipeline.base.config import PCA, FeatureDtype, VLMParams, stored_as
 from pipeline.base.differences import describe, differences
 from pipeline.base.errors import VLMError
 from pipeline.base.hub import could_be_hub_id
-from pipeline.base.projection import Basis
+from pipeline.base.projection import Basis, group_sizes
 from pipeline.base.source import Frames, row_key
 from pipeline.vlm.checkpoint_folder import (
     adapter_files,
@@ -69,6 +69,11 @@ class FeatureSpec:
     """The model's own features, where these are a projection of them."""
     basis: Basis | None = None
     """The projection; None where there is none, or where it has yet to be fitted."""
+
+    @property
+    def groups(self) -> tuple[int, ...]:
+        """How many slots each group of one variant has, in order."""
+        return group_sizes([slot.document() for slot in self.slots])
 
     @property
     def unfitted(self) -> bool:

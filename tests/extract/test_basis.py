@@ -17,6 +17,7 @@ from pipeline.extract.survey import sound_episodes, survey
 from pipeline.store import FeatureStore, part_path
 from pipeline.store.archive import archive, restore
 from pipeline.store.chunks import read_rows
+from pipeline.store.inventory import describe_stores, list_stores
 from pipeline.store.merging import merge
 from pipeline.store.proofs import Loss, Proof, proof_of, write_proofs
 from pipeline.store.schema import BASIS, read_spec
@@ -46,6 +47,9 @@ def test_rows_are_the_projected_features(projected):
     assert store.feature_shape == (whole.feature_shape[0], 24)
     assert verify(store.path).sound
     assert proof_of(store.attrs) == proof
+    listed = "\n".join(describe_stores(path := store.path.parent, list_stores(path), {}))
+    assert "x 24 (PCA of 128) in int8" in listed
+    assert f"as it is stored, {proof}" in listed
     values, full = widen(store.array("vl/features")), whole.array("vl/features")
     valid = whole.array("vl/slot_valid").astype(bool)
     group = [0, 1, 2, 2]  # mean, image_mean, and view_mean of two views
@@ -125,6 +129,16 @@ def test_stores_of_one_basis_are_merged(projected, changed, tmp_path):
     merged = FeatureStore.open(tmp_path / "stores" / "merged.zarr")
     assert merged.basis.digest == FeatureStore.open(copy).basis.digest
     assert verify(merged.path).sound
+
+
+def test_augmented_variants_share_the_basis(changed, tmp_path):
+    vlm = {"variants": 2, "pooling": ["mean"]}
+    params = changed(vlm=vlm, extract={"store": str(tmp_path / "two.zarr"), **PROJECTED})
+    run(params)
+    store = FeatureStore.open(params.extract.store)
+    assert store.basis.maps.shape == (1, 129, 24)
+    assert store.array("vl/features").shape[1] == 2
+    assert widen(store.array("vl/features"))[:, 1].any(axis=1).all()
 
 
 def test_no_more_numbers_than_the_model_has(changed):

@@ -4,7 +4,6 @@ import time
 from collections.abc import Sequence
 from contextlib import closing
 
-import numpy as np
 import torch
 
 from pipeline.base.config import VLMParams
@@ -20,8 +19,11 @@ from pipeline.vlm.processor import PixelSettings
 from pipeline.vlm.qwen import Extractor, layers_needed
 from pipeline.vlm.slots import Slot
 
-_PASSES = 5
-"""Timed passes of each layer, after one that warms up; their median counts."""
+_PASSES = 7
+"""Timed passes of each layer, in turns, after one that warms up.
+
+The fastest counts: other load on the machine makes a pass slower, never faster.
+"""
 _SAME = ("weights", "adapter", "processor", "prompt", "compute_dtype")
 """Entries of a feature spec in which the model must be that of the store."""
 
@@ -51,14 +53,13 @@ def time_passes(
     }
     model = load_model(vlm, layers_needed(slots.values()), target)
     text = model.language_model
-    every, seconds = text.layers, dict[int, float]()
-    for layer in layers:
-        text.layers = every[: layer + 1]
-        extractor = Extractor(model, PixelSettings.of(vlm), (slots[layer],))
-        took = list[float]()
-        for _ in range(1 + _PASSES):
+    every, settings = text.layers, PixelSettings.of(vlm)
+    extractors = {layer: Extractor(model, settings, (slots[layer],)) for layer in layers}
+    took: dict[int, list[float]] = {layer: [] for layer in layers}
+    for _ in range(1 + _PASSES):
+        for layer, extractor in extractors.items():
+            text.layers = every[: layer + 1]
             begun = time.perf_counter()
             extractor.extract([row])[0].cpu()  # waits for the device
-            took.append(time.perf_counter() - begun)
-        seconds[layer] = float(np.median(took[1:]))
-    return seconds
+            took[layer].append(time.perf_counter() - begun)
+    return {layer: min(passes[1:]) for layer, passes in took.items()}
