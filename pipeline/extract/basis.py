@@ -44,37 +44,21 @@ def fit_basis(surveyed: Survey, checked: Sequence[CheckedEpisode]) -> tuple[Basi
         for row in preparation.prepare(part)
         if isinstance(row, ReadyRow)  # all: no other store is known
     )
-    sample = _Sample(whole.groups)
     vlm = FrozenVLM.load(raw.vlm, whole, raw.extract.device)
+    sample: list[list[NDArray[np.float32]]] = [[] for _ in whole.groups]
     with tqdm(None, "fit the basis", count, unit="row", disable=None) as bar:
-        for batch, features in Encoder(vlm, _BATCH).encoded(ready):
-            for row, values in zip(batch, features, strict=True):
-                sample.add(int(np.searchsorted(rows, row.row)), values)
-            bar.update(len(batch))
-    fitted = [fit_map(sample.values(group), surveyed.spec.dim) for group in sample.groups]
+        for _, features in Encoder(vlm, _BATCH).encoded(ready):
+            for values in features:
+                groups = np.split(values, np.cumsum(whole.groups)[:-1])
+                for kept, group in zip(sample, groups, strict=True):
+                    turn = np.arange(min(len(group), _SLOTS_A_ROW)) + bar.n * _SLOTS_A_ROW
+                    kept.append(group[turn % len(group)])
+                bar.update()
+    # Zeros are of missing views.
+    joined = [np.concatenate(kept) for kept in sample]
+    fitted = [fit_map(rows[rows.any(axis=1)], surveyed.spec.dim) for rows in joined]
     least = min(share for _, share in fitted)
     return Basis(np.stack([affine for affine, _ in fitted])), (
         f"basis of {surveyed.spec.dim} of {whole.dim} numbers a slot, fitted on {count} rows: "
         f"keeps {least:.1%} or more of the variance of standardised channels"
     )
-
-
-class _Sample:
-    """Some features of each group of slots, in the order of their rows."""
-
-    def __init__(self, sizes: Sequence[int]) -> None:
-        self.groups = range(len(sizes))
-        self._sizes = sizes
-        self._starts = np.cumsum([0, *sizes])
-        self._kept: list[dict[int, NDArray[np.float32]]] = [{} for _ in sizes]
-
-    def add(self, number: int, values: NDArray[np.float32]) -> None:
-        """Keep some slots of the features (slot, channel) of the sample's row of this number."""
-        for group, size in enumerate(self._sizes):
-            turn = np.arange(min(size, _SLOTS_A_ROW)) + number * _SLOTS_A_ROW
-            chosen = values[self._starts[group] + turn % size]
-            self._kept[group][number] = chosen[chosen.any(axis=1)]  # zeros are of missing views
-
-    def values(self, group: int) -> NDArray[np.float32]:
-        """The features (row, channel) of a group."""
-        return np.concatenate([kept for _, kept in sorted(self._kept[group].items())])

@@ -9,13 +9,13 @@ import json
 from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 from pydantic import Field
 
 from pipeline.base.border import Document, Text
-from pipeline.base.errors import CheckpointIncomplete, ConfigError
-from pipeline.base.files import read_document, there, write_with_digest
+from pipeline.base.errors import CheckpointIncomplete
+from pipeline.base.files import OutputKind, read_document, refuse_foreign, write_with_digest
 
 SUFFIX = ".proofs.json"
 PROOF = "proof"
@@ -44,8 +44,7 @@ class Proof(Document):
 
     def __str__(self) -> str:
         worst = min(self.losses, key=lambda loss: loss.r2)
-        known = worst.low is not None and worst.high is not None
-        ends = f" ({worst.low:+.4f} to {worst.high:+.4f})" if known else ""
+        ends = "" if worst.low is None else f" ({worst.low:+.4f} to {worst.high:+.4f})"
         return (
             f"a probe of {self.recordings} recordings found {worst.r2:+.4f}{ends} in R2 beside "
             f"float32, at worst ({worst.of})"
@@ -55,7 +54,6 @@ class Proof(Document):
 class Proofs(Document):
     """The content of the file."""
 
-    kind: Literal["what storage types lose"]
     features: Text
     """`features_digest` of the store."""
     types: dict[Text, Proof]
@@ -83,14 +81,10 @@ def write_proofs(store: Path, spec: Mapping[str, Any], types: Mapping[str, Proof
     Raises `ConfigError` where something lies there that no probe wrote.
     """
     path, features = store.with_name(store.name + SUFFIX), features_digest(spec)
+    refuse_foreign(path, _PROOFS)
     before = _read(path)
-    if before is None and there(path):
-        raise ConfigError(
-            f"{path}: expected nothing there or the verdicts of a probe, found something else. It "
-            "was left as it is: move it away."
-        )
     kept = before.types if before is not None and before.features == features else {}
-    content = Proofs(kind="what storage types lose", features=features, types={**kept, **types})
+    content = Proofs(features=features, types={**kept, **types})
     write_with_digest(path, content.model_dump(mode="json"))
     return path
 
@@ -116,3 +110,6 @@ def _read(path: Path) -> Proofs | None:
     with suppress(CheckpointIncomplete):
         return read_document(path, Proofs)[0]
     return None
+
+
+_PROOFS = OutputKind("the verdicts of a probe", lambda path: _read(path) is not None)

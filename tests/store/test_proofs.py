@@ -42,6 +42,6 @@ def test_nothing_else_is_written_over(tmp_path: Path) -> None:
     mine = tmp_path / "whole.zarr.proofs.json"
     mine.write_text('{"my": "notes"}')
     assert find_proof(tmp_path, INT8) is None
-    with pytest.raises(ConfigError, match="found something else"):
+    with pytest.raises(ConfigError, match="expected nothing there or the verdicts of a probe"):
         write_proofs(tmp_path / "whole.zarr", WHOLE, {"int8": PROOF})
     assert mine.read_text() == '{"my": "notes"}'

@@ -112,14 +112,8 @@ def proofs(study: ProbeStudy) -> dict[str, Proof]:
     """The verdict on each codec, for the file beside the store."""
     losses: dict[str, list[Loss]] = {}
     for result in study.codecs:
-        figure = result.difference
-        loss = Loss(
-            of=result.of.name.label,
-            r2=figure.value,
-            low=figure.low,
-            high=figure.high,
-            error_std=result.error,
-        )
+        figures = {"error_std": result.error, **result.difference.document("r2")}
+        loss = Loss.model_validate({"of": result.of.name.label, **figures})
         losses.setdefault(result.codec, []).append(loss)
     of = {"recordings": study.folds.recordings, "ticks": len(study.folds.ticks)}
     return {codec: Proof(**of, losses=own) for codec, own in losses.items()}
