@@ -55,6 +55,21 @@ def row_race(
     )
 
 
+def code_race(store: FeatureStore, sizes: Mapping[str, Any], rounds: int) -> Race:
+    """Random VL rows of a store of codes, against C gathers of the same bytes from RAM."""
+    count, mapped = sizes["rows"], store.gatherer.tensor("features")
+    drawn = draws(sizes["draws"], count, 0, len(mapped))
+    ram, out = mapped.clone(), torch.zeros((count, *mapped.shape[1:]), dtype=mapped.dtype)
+    batch = store.gatherer.empty_batch(count, 1, 1, 1).touch()
+
+    def ours(rows: Index) -> None:
+        store.gatherer.copy(Selection({"features": rows}, {}), batch)
+
+    fast = ceilings(ram, out, drawn) | {OURS: each(drawn, ours)}
+    warm(store)
+    return race(fast, rounds, least_s=sizes["least_s"], before=all_drawn(fast, len(drawn)))
+
+
 def window_race(
     store: FeatureStore,
     folder: Path,

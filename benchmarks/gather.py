@@ -30,6 +30,7 @@ from benchmarks.contests import (
     OURS,
     OURS_2,
     batch_race,
+    code_race,
     draws,
     row_race,
     window_race,
@@ -74,13 +75,14 @@ QUICK = FULL | {
 def main() -> None:
     """Build, measure, print, clean up."""
     parser = arguments(__doc__ or "")
+    parser.add_argument("--codes", action="store_true", help="only rows of int8 codes")
     parser.add_argument("--folder", type=Path, default=None, help="scratch; a temporary one")
     options = parser.parse_args()
     sizes: dict[str, Any] = QUICK if options.quick else FULL
     folder = Path(tempfile.mkdtemp(prefix="gather-", dir=options.folder))
     try:
         torch.set_num_threads(1)
-        results, ratios, targets = measure(folder, sizes, options)
+        results, ratios, targets = (codes if options.codes else measure)(folder, sizes, options)
     finally:
         shutil.rmtree(folder)
     report(
@@ -158,7 +160,23 @@ def measure(
         for long, short in zip(opened.seconds["long"], opened.seconds["10 k ticks"], strict=True)
     )
     targets.append(at_most(f"open {sizes['long_store']} ticks / 10 k ticks", ratio, 2))
-    return results, ratios, targets
+    of_codes = codes(folder, sizes, options)
+    return results | of_codes[0], ratios | of_codes[1], targets + of_codes[2]
+
+
+def codes(
+    folder: Path, sizes: Mapping[str, Any], options: argparse.Namespace
+) -> tuple[dict[str, Any], dict[str, Any], list[dict[str, Any]]]:
+    """Rows of 49 slots of 128 numbers in int8, which with their scales take 136 bytes each."""
+    narrow = {"readings": 200, "states": 200, "channels": 16, "slots": 49, "dim": 128}
+    length = {"episodes": 2 if options.quick else 40, "ticks": 3750}
+    store = FeatureStore.open(write_store(folder / "codes.zarr", **narrow, **length, dtype="int8"))
+    found = code_race(store, sizes, options.rounds or (2 if options.quick else 15))
+    ceiling = min(CEILINGS, key=found.median)
+    part, amount = "rows of codes", {"rows": sizes["rows"]}
+    ratios = {"baseline": ceiling, **found.ratios(ceiling)}
+    target = against_ceiling(part, found, ceiling, 0.9)
+    return {part: found.results(amount)}, {part: ratios}, [target]
 
 
 def against_ceiling(part: str, found: Race, ceiling: str, wanted: float) -> dict[str, Any]:

@@ -91,7 +91,7 @@ def _prove(params: "Params") -> None:
         say(f"{folder} (step {checkpoint.step}): looks at no features, so nothing is to be proved")
         return
     say(f"{folder} (step {checkpoint.step}): {len(checkpoint.golden)} golden rows, {device}")
-    prove(checkpoint, LiveFeatures(params.vlm, trained, str(device)), say)
+    prove(checkpoint, LiveFeatures(params.vlm, trained, str(device), checkpoint.basis), say)
 
 
 if __name__ == "__main__":

@@ -52,6 +52,13 @@ class SlotDocument(Document):
     variant: _Small = 0
 
 
+class SpecProjection(Document):
+    """Of which width the features are a projection, and the digest of the basis."""
+
+    of: _Small
+    basis: Text
+
+
 class Spec(Document):
     """The entries of a feature spec that code uses, besides comparing them."""
 
@@ -59,6 +66,7 @@ class Spec(Document):
     views: list[ViewName]
     slots: list[SlotDocument]
     dim: _Small | None = None
+    pca: SpecProjection | None = None
     variants: Annotated[int, Field(ge=1, le=1000)] = 1
 
 

@@ -220,7 +220,7 @@ def plan_lines(
         reasons = ["there is no store yet"]
     else:
         before = RowSource(places.target)
-        reasons = _reasons(surveyed, before)
+        reasons = [*_reasons(surveyed, before)]
     rows, variants = build.specs[FEATURES].shape[0], surveyed.spec.variants
     left, rows_per_s = rows - known, digests.rate(surveyed.rate_name)
     if not left:
@@ -230,6 +230,8 @@ def plan_lines(
     else:
         time = f"about {duration(left / rows_per_s)} at {rows_per_s:.1f} rows/s, as last measured"
     needed, free = size(store_bytes(build.specs)), size(free_bytes(build.part))
+    if surveyed.spec.basis is not None and state == "new":
+        reasons.append("the basis of the store or build there is kept, so that its rows stay known")
     return [
         *(f"WARNING: {warning}" for warning in _warnings(surveyed)),
         *(f"why: {reason}" for reason in reasons),

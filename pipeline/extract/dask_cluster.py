@@ -154,7 +154,7 @@ class ExtractionPlugin(WorkerPlugin):
             )
         if not self.local:
             vlm, dtype, spec = surveyed.vlm, surveyed.extract.dtype, surveyed.spec
-            ours = feature_spec(vlm, dtype, spec.views, file_digest)
+            ours = feature_spec(vlm, dtype, spec.views, file_digest, basis=spec.basis)
             if ours.digest != spec.digest:
                 lines = "; ".join(describe(differences(ours.attrs(), spec.attrs())))
                 raise ConfigError(

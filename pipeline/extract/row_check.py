@@ -93,8 +93,9 @@ def reextract(path: Path, params: Params, say: Callable[[str], None]) -> Reextra
     storage dtype.
     """
     store, options = FeatureStore.open(path), params.verify
+    own = params.extract.model_copy(update={"store": path})  # whose basis is taken
     with closing(ContentDigests(ledger_path(path))) as digests:
-        surveyed = survey(params, digests)
+        surveyed = survey(params.model_copy(update={"extract": own}), digests)
     spec = surveyed.spec
     if other := differences(store.spec, spec.attrs()):
         raise StoreMismatch(

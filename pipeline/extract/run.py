@@ -45,7 +45,7 @@ def extract(params: Params, say: Say, repair: bool = False) -> ExtractionReport 
     target, only_plan = params.extract.store, params.extract.plan
     with _opened(target, only_plan) as digests:
         places = StorePlaces(target)
-        surveyed, checked, state = _survey(params, digests, places, repair)
+        surveyed, checked, state = _survey(params, digests, places, repair, say)
         for line in _survey_lines(surveyed):
             say(line)
         if state == "current":
@@ -69,6 +69,9 @@ def extract(params: Params, say: Say, repair: bool = False) -> ExtractionReport 
                 return None
             if state == "new":
                 check_space(build, checked, sources)
+                if surveyed.spec.unfitted:
+                    surveyed = _fitted(surveyed, checked, say)
+                    build.plan = surveyed.plan
                 # From here on, no check refuses the run.
                 places = places.set_build_aside(surveyed, say)
                 lay_out(build, checked, surveyed, row_sources(places.known, surveyed))
@@ -94,7 +97,7 @@ def _opened(target: Path, only_plan: bool) -> Generator[ContentDigests]:
 
 
 def _survey(
-    params: Params, digests: ContentDigests, places: StorePlaces, repair: bool
+    params: Params, digests: ContentDigests, places: StorePlaces, repair: bool, say: Say
 ) -> tuple[Survey, list[CheckedEpisode], BuildState]:
     """The survey, for a new build its sound episodes, each read completely, and the state."""
     surveyed = survey(params, digests)
@@ -103,6 +106,8 @@ def _survey(
         resolve_device(params.extract.device)
     if state == "new" or (surveyed.bad and params.data.on_bad_episode == "stop"):
         surveyed, checked = sound_episodes(surveyed, digests)  # lists everything that is wrong
+        if repair and surveyed.spec.unfitted:  # the store's basis is damaged, too
+            surveyed = _fitted(surveyed, checked, say)
         state = places.state(surveyed.plan, repair)
     if repair and places.finished != surveyed.plan:
         raise StoreMismatch(
@@ -120,6 +125,15 @@ def _new_build(
     for line in _timeline_lines(surveyed, checked):
         say(line)
     return StoreBuild(places.target, build_arrays(checked, surveyed), surveyed.plan)
+
+
+def _fitted(surveyed: Survey, checked: Sequence[CheckedEpisode], say: Say) -> Survey:
+    """The survey with a basis for its projected features, fitted on some of their rows."""
+    from pipeline.extract.basis import fit_basis  # the model: seconds to import
+
+    basis, line = fit_basis(surveyed, checked)
+    say(line)
+    return surveyed.on(basis)
 
 
 def _executor(surveyed: Survey) -> Executor:

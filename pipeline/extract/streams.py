@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from pipeline.base.arrays import first_non_finite
+from pipeline.base.config import stored_as
 from pipeline.base.errors import ConfigError, DiskFull, NumericsError
 from pipeline.base.files import free_bytes
 from pipeline.base.provenance import tuned_on_attributes
@@ -20,7 +21,8 @@ from pipeline.extract.build_state import store_bytes
 from pipeline.extract.survey import CheckedEpisode, Survey, embodiment_of
 from pipeline.store import FEATURES, SCHEMA, RowSource, Sizes, StoreBuild, arrays
 from pipeline.store.episodes import episode_arrays
-from pipeline.store.schema import MOST_ROW_BYTES, ArraySpec
+from pipeline.store.proofs import PROOF, find_proof
+from pipeline.store.schema import BASIS, MOST_ROW_BYTES, ArraySpec
 from pipeline.vlm.checkpoint_folder import tuned_on
 from pipeline.vlm.feature_spec import FeatureSpec
 
@@ -59,6 +61,8 @@ def lay_out(
         build.write(name, 0, values)
     valid = [_slot_valid(episode.ticks, survey.spec) for episode in checked]
     build.write("vl/slot_valid", 0, np.concatenate(valid))
+    if survey.spec.basis is not None:
+        build.write(BASIS, 0, survey.spec.basis.maps)
     starts = {"sensor": 0, "state": 0}
     for episode in tqdm(checked, "streams", unit="episode", disable=None, leave=False):
         _write_streams(build, episode, starts)
@@ -68,7 +72,7 @@ def lay_out(
 
 def build_arrays(checked: Sequence[CheckedEpisode], survey: Survey) -> dict[str, ArraySpec]:
     """The arrays that these episodes need."""
-    embodiment, extract = embodiment_of(checked), survey.extract
+    embodiment, extract, whole = embodiment_of(checked), survey.extract, survey.spec.whole
     count = Counter[str]()
     for episode in checked:
         count.update(episode.counts)
@@ -85,8 +89,10 @@ def build_arrays(checked: Sequence[CheckedEpisode], survey: Survey) -> dict[str,
         action_dim=len(embodiment.action.names),
         channel=len(embodiment.sensor.names),
         state_dim=len(embodiment.state.names),
+        group=0 if whole is None else len(whole.groups),
+        input=0 if whole is None else whole.dim + 1,
     )
-    specs = arrays(sizes, extract.dtype, extract.sensor_dtype)
+    specs = arrays(sizes, stored_as(extract.dtype), extract.sensor_dtype)
     if (row_bytes := specs[FEATURES].row_bytes) > MOST_ROW_BYTES:
         raise ConfigError(
             f"a row of features would take {size(row_bytes)}, and no reader takes more than "
@@ -158,5 +164,12 @@ def _attributes(checked: Sequence[CheckedEpisode], survey: Survey) -> dict[str, 
         "action_hz": tick_hz((episode.ticks.recorded_hz for episode in checked), data.action_hz),
         "vlm_reuse_count": data.vlm_reuse_count,
         "environment": [],
+        **_proof(survey),
         **tuned_on_attributes(tuned_on(survey.vlm)),
     }
+
+
+def _proof(survey: Survey) -> dict[str, Any]:
+    """The attribute with what a probe found that this type of storage loses, if one did."""
+    proof = find_proof(survey.target.parent, survey.spec.document)
+    return {} if proof is None else {PROOF: proof.model_dump(mode="json")}

@@ -20,12 +20,14 @@ from pipeline.base.config import DataParams, ExtractParams, Params, VLMParams
 from pipeline.base.digests import ContentDigests, joint_digest
 from pipeline.base.documents import Border
 from pipeline.base.errors import RecordingError, StoreMismatch, VLMError
+from pipeline.base.projection import Basis
 from pipeline.base.provenance import RATE_TOLERANCE, Streams
 from pipeline.base.text import capped
 from pipeline.data import BadEpisode, Recording, content_digest, open_recordings
 from pipeline.data.episode import Embodiment, common_embodiment, read_episode
 from pipeline.data.recording import absolute
 from pipeline.data.timeline import ActionRotation, choose_action_rotation
+from pipeline.store.basis import known_basis
 from pipeline.store.documents import EpisodeText
 from pipeline.store.episodes import EpisodeRows
 from pipeline.vlm.feature_spec import FeatureSpec, feature_spec
@@ -79,6 +81,11 @@ class Survey:
     spec: FeatureSpec
     action_rotation: ActionRotation
     plan: str
+
+    def on(self, basis: Basis) -> "Survey":
+        """The survey of the same store with its features projected on this basis."""
+        spec = self.spec.on(basis)
+        return replace(self, spec=spec, plan=_plan(spec, self.data, self.extract, self.episodes))
 
     @property
     def target(self) -> Path:
@@ -151,7 +158,18 @@ def _spec_and_plan(
     """The feature spec and the plan digest of a store of these episodes."""
     views = sorted({view for episode in episodes for view in episode.views})
     spec = feature_spec(vlm, extract.dtype, views, digests.of, digests.text)
-    return spec, joint_digest(
+    if spec.unfitted and (known := known_basis(extract.store, spec.document)):
+        spec = spec.on(known)
+    return spec, _plan(spec, data, extract, episodes)
+
+
+def _plan(
+    spec: FeatureSpec,
+    data: DataParams,
+    extract: ExtractParams,
+    episodes: Sequence[SurveyedEpisode],
+) -> str:
+    return joint_digest(
         spec.digest,
         extract.sensor_dtype,
         *(["rate"] if data.action_hz is None else []),  # earlier stores did not keep it

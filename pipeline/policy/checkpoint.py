@@ -2,7 +2,8 @@
 
 The JSON has the feature spec of the store, the streams with their names and units, the
 normalisation, the params, and the episodes of training, val and test. `golden.safetensors` has the
-frames and features of the store's golden rows, against which a live model is checked. There is no
+frames and features of the store's golden rows, against which a live model is checked, and
+`basis.safetensors` the basis on which it projects its features, if the store has one. There is no
 pickle. A kill at any instant leaves the previous checkpoint or the new one. The module imports
 torch, which takes over a second, only where weights are read.
 """
@@ -16,6 +17,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, field_validator, model_validator
+from safetensors import safe_open
 
 from pipeline.base.config import TrainHeadParams
 from pipeline.base.config.section import Section
@@ -32,6 +34,7 @@ from pipeline.base.files import (
     write_tensors,
     write_with_digest,
 )
+from pipeline.base.projection import Basis
 from pipeline.base.provenance import (
     MOST_GOLDEN,
     SIDES,
@@ -54,6 +57,7 @@ FORMAT: Literal[3] = 3
 """3: the split has three sides; in 2 it had two, and the reported side chose the checkpoint."""
 Sha256 = Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
 WEIGHTS, DOCUMENT, GOLDEN = "policy.safetensors", "policy.json", "golden.safetensors"
+BASIS = "basis.safetensors"
 _FRAMES = "frames/"
 CHECKPOINT = OutputKind("a checkpoint of a policy", lambda folder: (folder / DOCUMENT).is_file())
 _Layout = dict[str, tuple[str, tuple[int, ...]]]
@@ -198,6 +202,8 @@ class PolicyCheckpoint:
     """Empty where the store has none, or an earlier version wrote the checkpoint."""
     digest: str = ""
     """SHA-256 of the weights' file; empty before the checkpoint is saved."""
+    basis: Basis | None = None
+    """Of the store's projected features; None where they are the model's own."""
 
     def policy(self, device: "torch.device | str" = "cpu") -> "Policy":
         """The policy with these weights and its feature spec, in evaluation mode."""
@@ -257,6 +263,8 @@ def save_policy(
         digests = [write_tensors(temporary / WEIGHTS, checkpoint.weights)]
         if checkpoint.golden:
             digests.append(write_tensors(temporary / GOLDEN, _golden_tensors(checkpoint.golden)))
+        if checkpoint.basis is not None:
+            write_tensors(temporary / BASIS, _basis_tensors(checkpoint.basis))
         write_with_digest(temporary / DOCUMENT, checkpoint.document(*digests))
         beside(temporary)
 
@@ -300,6 +308,7 @@ def load_policy(folder: Path) -> PolicyCheckpoint:
         instructions=document.instructions,
         weights=weights,
         golden=_read_golden(folder, document),
+        basis=_read_basis(folder, document),
         digest=document.weights_sha256,
     )
 
@@ -310,6 +319,7 @@ def check_policy(folder: Path) -> None:
     check_digest(folder / WEIGHTS, document.weights_sha256)
     if document.golden is not None:
         check_digest(folder / GOLDEN, document.golden.sha256)
+    _read_basis(folder, document)
 
 
 def _described_weights(folder: Path, document: PolicyDocument) -> _Layout:
@@ -363,6 +373,25 @@ def _golden_tensors(rows: Sequence[GoldenRow]) -> "dict[str, Tensor]":
             **{f"{_FRAMES}{view}": frame for view, frame in row.frames.items()},
         }.items()
     }
+
+
+def _basis_tensors(basis: Basis) -> "dict[str, Tensor]":
+    import torch
+
+    return {"maps": torch.from_numpy(np.array(basis.maps))}
+
+
+def _read_basis(folder: Path, document: PolicyDocument) -> Basis | None:
+    """The basis, which gives the digest in the document's feature spec."""
+    pca, path = document.feature_spec.pca, folder / BASIS
+    if pca is None:
+        return None
+    RUN_FILES.check_file(path)
+    with RUN_FILES.foreign(path, "cannot be read"), safe_open(path, "numpy") as file:
+        basis = Basis(np.asarray(file.get_tensor("maps")))
+    if basis.digest != pca.basis:
+        raise RUN_FILES.refusal(path, f"its digest is not {pca.basis}, as {DOCUMENT} says")
+    return basis
 
 
 def _read_golden(folder: Path, document: PolicyDocument) -> tuple[GoldenRow, ...]:

@@ -19,6 +19,7 @@ from pipeline.base.config import TuningParams, VLMParams
 from pipeline.base.errors import CheckpointMismatch
 from pipeline.base.packing import pack
 from pipeline.base.printed_commands import command
+from pipeline.base.projection import Basis
 from pipeline.base.provenance import row_key
 from pipeline.base.text import capped
 from pipeline.policy.checkpoint import PolicyCheckpoint
@@ -35,13 +36,15 @@ _SHOWN = 6
 class LiveFeatures:
     """The frozen model of `vlm`, which computes a policy's features from live frames."""
 
-    def __init__(self, vlm: VLMParams, trained: Mapping[str, Any], device: str) -> None:
-        """Load the model; `trained` is the feature spec of the policy's checkpoint.
+    def __init__(
+        self, vlm: VLMParams, trained: Mapping[str, Any], device: str, basis: Basis | None = None
+    ) -> None:
+        """Load the model; `trained` and `basis` are those of the policy's checkpoint.
 
         Raises `CheckpointMismatch`, before a weight is loaded, where the model gives other features
         than the policy was trained on, and `VLMError` as `LiveVLM.load` does.
         """
-        self.spec = live_spec(vlm, trained["views"])
+        self.spec = live_spec(vlm, trained["views"], basis)
         """The spec of the features that this model gives."""
         refuse_other_features(vlm, trained, self.spec)
         self._model = LiveVLM.load(vlm, self.spec, TuningParams(method="none"), device).eval()

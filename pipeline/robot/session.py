@@ -76,7 +76,8 @@ class ServedPolicy:
         policy = checkpoint.policy(target)
         features = None
         if "features" in policy.encoders:
-            features = LiveFeatures(vlm, checkpoint.source["feature_spec"], str(target))
+            trained = checkpoint.source["feature_spec"]
+            features = LiveFeatures(vlm, trained, str(target), checkpoint.basis)
             prove(checkpoint, features, say)
         return cls(checkpoint, policy, features, str(folder), FirstLook(checkpoint))
 

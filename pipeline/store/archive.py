@@ -53,9 +53,11 @@ from pipeline.store.paths import put_in_place as put_store_in_place
 from pipeline.store.reader import FeatureStore
 from pipeline.store.schema import (
     ARRAY_NAMES,
+    BASIS,
     GROUPS,
     KEYS,
     ArraySpec,
+    array_names,
     array_of,
     check_agreement,
     chunk_paths,
@@ -103,12 +105,17 @@ class Manifest(Document):
     def specs(self, archive: Path) -> dict[str, ArraySpec]:
         """The arrays of the store. Raises `StoreIncomplete` where their metadata are wrong."""
         specs: dict[str, ArraySpec] = {}
-        for name in ARRAY_NAMES:
+        for name in self.names:
             where = f"{archive}, {name}/zarr.json of the store"
             document = _BORDER.parse_json(self.text(archive, name), dict[str, Any], where)
             specs[name] = array_of(document, name, where, _BORDER)
         check_agreement(archive, self.attributes(archive), specs, _BORDER)
         return specs
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The names of the arrays."""
+        return (*ARRAY_NAMES, *([BASIS] if f"{BASIS}/zarr.json" in self.metadata else []))
 
     def text(self, archive: Path, place: str) -> str:
         """The text of the `zarr.json` in a folder of the store."""
@@ -265,7 +272,7 @@ def _rebuild(manifest: Manifest, archive: Path, target: Path, part: Path) -> Non
         _copy_golden(archive, part, root)
         # The root's attributes hold the plan. With them the folder looks like an extraction's
         # unfinished build, which no later restoration may remove; so they are written last.
-        for place in (*GROUPS, *ARRAY_NAMES, *golden_places(root), ""):
+        for place in (*GROUPS, *manifest.names, *golden_places(root), ""):
             if not place:
                 sync_folders(part)
             path = part / place / "zarr.json"
@@ -383,7 +390,7 @@ def _metadata_of(store: Path) -> dict[str, str]:
     border, attributes = store_border(store), group_attributes(store)
     golden = golden_places(StoreAttributes.of(store, attributes))
     texts: dict[str, str] = {}
-    for place in ("", *GROUPS, *ARRAY_NAMES, *golden):
+    for place in ("", *GROUPS, *array_names(store), *golden):
         path = store / place / "zarr.json"
         texts[path.relative_to(store).as_posix()] = border.read_bytes(path).decode()
     return texts

@@ -27,13 +27,13 @@ from pipeline.base.files import disk_full_named
 from pipeline.store.documents import mend, store_border
 from pipeline.store.paths import group_attributes, laid_out_attributes
 from pipeline.store.schema import (
-    ARRAY_NAMES,
     CHECKSUMS,
     FEATURES,
     GROUPS,
     INCREMENTAL,
     TRAILER_BYTES,
     ArraySpec,
+    array_names,
     chunk_path,
     chunk_paths,
     read_spec,
@@ -97,7 +97,7 @@ def check_metadata(root: Path) -> None:
 
 def _metadata_digest(root: Path, attributes: Mapping[str, Any]) -> str:
     """The digest of the metadata on disk, with these root attributes."""
-    places, border = ("", *GROUPS, *ARRAY_NAMES), store_border(root)
+    places, border = ("", *GROUPS, *array_names(root)), store_border(root)
     documents = {at: border.read_json(root / at / "zarr.json", dict[str, Any]) for at in places}
     kept = {name: value for name, value in attributes.items() if name != METADATA_DIGEST}
     documents[""]["attributes"] = kept

@@ -30,6 +30,7 @@ from pipeline.store.paths import (
     laid_out_attributes,
     recover,
 )
+from pipeline.store.proofs import proof_of
 from pipeline.store.reader import FeatureStore
 from pipeline.store.schema import CHECKSUMS, FEATURES, ArraySpec, read_spec, read_specs
 
@@ -194,6 +195,8 @@ def _details(entry: StoreEntry) -> Iterator[str]:
     if entry.damage:
         # What is wrong, without the advice after it.
         yield f"damaged: {entry.damage.split('. ', 1)[0].splitlines()[0]}"
+    if entry.attributes and (proof := proof_of(entry.attributes.raw)):
+        yield f"as it is stored, {proof}"
     if entry.kind == "build" and is_locked(entry.base):
         yield "being built"
 
@@ -206,8 +209,10 @@ def _spec(entry: StoreEntry) -> tuple[str, str]:
         f"{slot.pooling} of {'the vision tower' if slot.layer == 'vision' else slot.layer}"
         for slot in entry.attributes.slots
     ]
+    pca = entry.attributes.feature_spec.pca
+    dim = packed_dim(features.stored_dtype, features.shape[2])
+    width = f"{dim} (PCA of {pca.of})" if pca else f"{dim}"
     return entry.attributes.feature_spec.digest[:8], (
-        f"{features.shape[1]} slots x {packed_dim(features.stored_dtype, features.shape[2])} in "
-        f"{features.stored_dtype}, {' + '.join(dict.fromkeys(slots))}, prompt "
-        f"{document.get('prompt')}"
+        f"{features.shape[1]} slots x {width} in {features.stored_dtype}, "
+        f"{' + '.join(dict.fromkeys(slots))}, prompt {document.get('prompt')}"
     )

@@ -50,6 +50,7 @@ from pipeline.store.paths import (
 from pipeline.store.reader import FeatureStore
 from pipeline.store.schema import (
     ARRAY_NAMES,
+    BASIS,
     CHECKSUMS,
     FEATURES,
     KEYS,
@@ -158,6 +159,8 @@ class MergedIndex:
             spec = read_spec(self.having(stream).path, name)
             rows = len(self.arrays[name]) if name in self.arrays else self.count(stream)
             specs[name] = replace(spec, shape=(rows, *spec.shape[1:]), stored_chunk_rows=None)
+        if self.stores[0].basis is not None:
+            specs[BASIS] = read_spec(self.stores[0].path, BASIS)
         return specs
 
     def having(self, stream: str) -> FeatureStore:
@@ -291,6 +294,8 @@ def _copy(build: StoreBuild, merged: MergedIndex) -> None:
     build.allocate()
     for name, values in merged.arrays.items():
         build.write(name, 0, values)
+    if first.basis is not None:
+        build.write(BASIS, 0, first.basis.maps)
     for name in tqdm(_COPIED, "merge", unit="array", disable=None, leave=False):
         for run in merged.runs:
             for rows, values in run.blocks(name):  # `write` skips linked chunks

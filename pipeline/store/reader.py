@@ -15,13 +15,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.base.arrays import dim_of, widen
+from pipeline.base.projection import Basis
 from pipeline.base.provenance import GoldenRow
+from pipeline.store.basis import checked_basis
 from pipeline.store.chunks import check_seal
 from pipeline.store.episodes import Episode, check_index, check_positions, episode_of, read_episodes
 from pipeline.store.golden_rows import GoldenFrames, read_golden
 from pipeline.store.memory_map import map_flat
 from pipeline.store.paths import read_attributes
 from pipeline.store.schema import (
+    BASIS,
     FEATURES,
     KEYS,
     POSITIONS,
@@ -130,6 +133,15 @@ class FeatureStore:
         """(slot, dim) of one variant of a VL row."""
         features = self._arrays[FEATURES]
         return features.shape[1] // self.variants, dim_of(features)
+
+    @cached_property
+    def basis(self) -> Basis | None:
+        """The basis on which features are projected; None where they are the model's own.
+
+        Raises `StoreIncomplete` where it is not that of the feature spec.
+        """
+        pca = self.attrs["feature_spec"].get("pca")
+        return pca and checked_basis(self.path, pca["basis"], self._arrays[BASIS])
 
     @property
     def action_dim(self) -> int:

@@ -11,7 +11,7 @@ import os
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import zarr
@@ -20,6 +20,8 @@ from zarr.codecs import BytesCodec, Crc32cCodec
 from pipeline.base.arrays import packed_size
 from pipeline.base.differences import differences
 from pipeline.base.documents import Border, shown
+from pipeline.base.projection import group_sizes
+from pipeline.base.provenance import Spec
 from pipeline.store.documents import ArrayDocument, StoreAttributes, store_border
 
 SCHEMA = 2
@@ -35,6 +37,8 @@ _MOST_CHUNK_BYTES = 2 * CHUNK_BYTES
 MOST_ROW_BYTES = 2**26
 
 FEATURES, KEYS, CHECKSUMS = "vl/features", "vl/key", "vl/checksum"
+BASIS = "vl/basis"
+"""The basis of projected features (`pipeline.base.projection`); other stores have none."""
 INCREMENTAL = (FEATURES, KEYS, CHECKSUMS)
 """The arrays written row by row while the model works; all others are known beforehand."""
 
@@ -104,7 +108,7 @@ class ArraySpec:
     @property
     def row_multiple(self) -> int:
         """Rows of which a chunk has a multiple, so that it fills whole pages."""
-        if self.name != FEATURES or not self.row_bytes:
+        if self.name not in (FEATURES, BASIS) or not self.row_bytes:
             return ROW_MULTIPLE
         multiples = [page // math.gcd(page, self.row_bytes) for page in _PAGES]
         fitting = (rows for rows in multiples if rows * self.row_bytes <= CHUNK_BYTES)
@@ -202,6 +206,10 @@ class Sizes:
     channel: int
     """Channels of the sensor."""
     state_dim: int
+    group: int = 0
+    """Groups of slots that are projected, each with a map of its own."""
+    input: int = 0
+    """Inputs of a map: the model's channels, and 1."""
 
 
 _ARRAYS = {
@@ -211,6 +219,7 @@ _ARRAYS = {
     "vl/frame_time": ("f8", "vl_row", "view"),
     KEYS: ("u1", "vl_row", "key_byte"),
     CHECKSUMS: ("u4", "vl_row"),
+    BASIS: ("f4", "group", "input", "rank"),
     "tick/time": ("f8", "tick"),
     "tick/action": ("f4", "tick", "action_dim"),
     "tick/vl_row": ("i8", "tick"),
@@ -225,7 +234,8 @@ _ARRAYS = {
     "episode/text": ("u1", "byte"),
 }
 """Every array in the order of the contract: its type ("" where a param sets it), then its axes."""
-ARRAY_NAMES = tuple(_ARRAYS)
+ARRAY_NAMES = tuple(name for name in _ARRAYS if name != BASIS)
+"""The arrays that every store has."""
 GROUPS = tuple(sorted({name.partition("/")[0] for name in ARRAY_NAMES}))
 
 
@@ -241,10 +251,12 @@ _HOLDS = {"bfloat16": "u2", "float8": "u1", "int8": "i1"}
 def arrays(sizes: Sizes, features_dtype: str, sensor_dtype: str) -> dict[str, ArraySpec]:
     """Every array of a store, by name, in the order of the contract."""
     lengths = {**vars(sizes), "episode_edge": sizes.episode + 1, "key_byte": KEY_BYTES}
+    lengths["rank"] = sizes.dim
     lengths["dim"] = packed_size(features_dtype, sizes.dim)
     chosen = {FEATURES: _HOLDS.get(features_dtype, features_dtype), "sensor/values": sensor_dtype}
     specs: dict[str, ArraySpec] = {}
-    for name, (code, *axes) in _ARRAYS.items():
+    for name in (*ARRAY_NAMES, *([BASIS] if sizes.group else [])):
+        code, *axes = _ARRAYS[name]
         dtype = np.dtype(code or chosen[name]).newbyteorder("<")
         specs[name] = ArraySpec(name, tuple(lengths[axis] for axis in axes), dtype)
     return specs
@@ -252,7 +264,12 @@ def arrays(sizes: Sizes, features_dtype: str, sensor_dtype: str) -> dict[str, Ar
 
 def read_specs(root: Path) -> dict[str, ArraySpec]:
     """The arrays of a store or a build on disk, by name, as `read_spec` reads them."""
-    return {name: read_spec(root, name) for name in ARRAY_NAMES}
+    return {name: read_spec(root, name) for name in array_names(root)}
+
+
+def array_names(root: Path) -> tuple[str, ...]:
+    """The names of the arrays of a store or a build on disk."""
+    return (*ARRAY_NAMES, *([BASIS] if (root / BASIS / "zarr.json").exists() else []))
 
 
 def read_spec(root: Path, name: str) -> ArraySpec:
@@ -347,7 +364,18 @@ def check_agreement(
     wrong = [f"{at}: expected {n}, found {len(k)}" for at, (k, n) in pairs.items() if len(k) != n]
     if len(spec.slots) % spec.variants:
         wrong.append(f"feature_spec.variants: expected a divisor of {len(spec.slots)} slots")
+    basis = BASIS in specs and specs[BASIS].shape
+    if basis != (expected := _basis_shape(spec)):
+        wrong.append(f"feature_spec.pca: expected the array {BASIS} {expected}, found {basis}")
     rows = specs[FEATURES].shape[0]
     wrong += [f"golden: row {row.row} of {rows}" for row in attrs.golden if row.row >= rows]
     if wrong:
         raise border.refusal(root / "zarr.json", "; ".join(wrong))
+
+
+def _basis_shape(spec: Spec) -> tuple[int, ...] | Literal[False]:
+    """The shape of the basis of this spec's features; False without one."""
+    if spec.pca is None:
+        return False
+    plain = [slot.model_dump() for slot in spec.slots if not slot.variant]
+    return len(group_sizes(plain)), spec.pca.of + 1, spec.dim or 0

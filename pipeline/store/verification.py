@@ -10,7 +10,7 @@ from pipeline.store.chunks import UNSEALED, check_metadata, damages
 from pipeline.store.documents import StoreAttributes, mend
 from pipeline.store.paths import find_attributes, read_plan
 from pipeline.store.reader import FeatureStore
-from pipeline.store.schema import ARRAY_NAMES, FEATURES, ArraySpec, check_agreement, read_spec
+from pipeline.store.schema import FEATURES, ArraySpec, array_names, check_agreement, read_spec
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ def verify(path: Path) -> Verification:
     def note(error: StoreIncomplete) -> None:
         issues.append(str(error).removesuffix(f". {mend(path)}"))
 
-    for name in ARRAY_NAMES:
+    for name in array_names(path):
         try:
             specs[name] = read_spec(path, name)
         except StoreIncomplete as error:
@@ -77,7 +77,7 @@ def verify(path: Path) -> Verification:
         try:
             store = FeatureStore.open(path)
             store.array("tick/vl_row")  # checks the positions that ticks hold
-            _ = store.episodes, store.golden
+            _ = store.episodes, store.golden, store.basis
         except StoreIncomplete as error:
             note(error)
     return Verification(

@@ -35,7 +35,7 @@ from pipeline.train.finetuning_rows import (
     find_recordings,
     known_digests,
 )
-from pipeline.vlm.feature_spec import FeatureSpec, feature_spec
+from pipeline.vlm.feature_spec import FeatureSpec, dtype_of, feature_spec
 from pipeline.vlm.live import LiveVLM
 from pipeline.vlm.preparation import Preparer
 
@@ -144,13 +144,13 @@ class ModelFeatureSource(FeatureSource):
         if self._finetune.tuning.method == "full":
             changes = {"checkpoint": learned, "revision": None, "adapter": None}
         vlm = self._vlm.model_copy(update=changes)
-        storage = self._spec.document["storage_dtype"]
+        dtype, basis = dtype_of(self._spec.document), self._spec.basis
 
         def digest(path: Path) -> str:
             # The base's files are read once; the tuned ones change with every checkpoint.
             return file_digest(path) if path.is_relative_to(folder) else self._base_digest(path)
 
-        return feature_spec(vlm, storage, self._spec.views, digest)
+        return feature_spec(vlm, dtype, self._spec.views, digest, basis=basis)
 
 
 def head_params(params: Params) -> TrainHeadParams:

@@ -28,7 +28,7 @@ from pipeline.policy.observation import LiveObservation
 from pipeline.store import Batch, Episode, FeatureStore, episode_name
 from pipeline.train.batches import BatchIndices, Prefetch, Windows
 from pipeline.train.training_data import list_differences
-from pipeline.vlm.feature_spec import FeatureSpec, feature_spec
+from pipeline.vlm.feature_spec import FeatureSpec, dtype_of, feature_spec
 from pipeline.vlm.preparation import PreparedRow, Preparer
 
 _SHOWN = 5
@@ -82,7 +82,8 @@ def check_spec(store: FeatureStore, params: Params, digests: ContentDigests) -> 
     be used.
     """
     stored = store.spec
-    spec = feature_spec(params.vlm, stored["storage_dtype"], stored["views"], digests.of)
+    views, basis = stored["views"], store.basis
+    spec = feature_spec(params.vlm, dtype_of(stored), views, digests.of, basis=basis)
     if spec.digest != stored["digest"]:
         raise StoreMismatch(
             f"{store.path}: tuning begins with the model whose features the store holds, but its "

@@ -329,6 +329,7 @@ class Trainer:
             weights=self.source.policy_of(self.averaged).state_dict(),
             metrics=metrics,
             golden=self.golden,
+            basis=self.store.basis,
         )
 
         def write_beside(temporary: Path) -> None:

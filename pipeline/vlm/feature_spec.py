@@ -8,16 +8,17 @@ its dtype.
 import hashlib
 import json
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from pipeline.base.config import VLMParams
+from pipeline.base.config import PCA, FeatureDtype, VLMParams, stored_as
 from pipeline.base.differences import describe, differences
 from pipeline.base.errors import VLMError
 from pipeline.base.hub import could_be_hub_id
 from pipeline.base.printed_commands import command
+from pipeline.base.projection import Basis, group_sizes
 from pipeline.base.provenance import Frames, row_key
 from pipeline.vlm.checkpoint_folder import (
     adapter_files,
@@ -38,6 +39,8 @@ AUGMENTATION_VERSION = 1
 
 _WIDTH_OF_3B = 2048
 """Width of the hidden states of Qwen2.5-VL-3B."""
+
+_LAYERS_OF_3B = 36
 
 _MANY_LAYERS = 10_000
 """A stand-in for an unknown number of layers, on which the number of slots does not depend."""
@@ -62,6 +65,27 @@ class FeatureSpec:
     """Final height and width of every frame, in pixels."""
     variants: int
     """How many times a row holds the slots: first for the plain frames, then for augmented ones."""
+    whole: "FeatureSpec | None" = None
+    """The model's own features, where these are a projection of them."""
+    basis: Basis | None = None
+    """The projection; None where there is none, or where it has yet to be fitted."""
+
+    @property
+    def groups(self) -> tuple[int, ...]:
+        """How many slots each group of one variant has, in order."""
+        return group_sizes([slot.document() for slot in self.slots])
+
+    @property
+    def unfitted(self) -> bool:
+        """Whether the features are a projection whose basis is not known yet."""
+        return self.whole is not None and self.basis is None
+
+    def on(self, basis: Basis) -> "FeatureSpec":
+        """The spec of the same projection on this basis."""
+        assert self.whole is not None, "a spec of the model's own features has no basis"
+        pca = self.document["pca"] | {"basis": basis.digest}
+        document = self.document | {"pca": pca}
+        return replace(self, document=document, digest=_digest(document), basis=basis)
 
     def attrs(self) -> dict[str, Any]:
         """The document with its digest, as a store keeps it."""
@@ -74,17 +98,18 @@ class FeatureSpec:
 
 def feature_spec(
     vlm: VLMParams,
-    storage_dtype: str,
+    dtype: FeatureDtype,
     views: Sequence[str],
     digest_file: Callable[[Path], str],
     remember: Callable[[str, Callable[[], str]], str] | None = None,
+    basis: Basis | None = None,
 ) -> FeatureSpec:
-    """The spec of the features of `vlm` for these views, stored as `storage_dtype`.
+    """The spec of the features of `vlm` for these views, stored as `dtype`, on this basis.
 
     Reads the checkpoint's small files; `digest_file` returns the content digest of one file and may
     remember it. `remember` (`ContentDigests.text`) may keep the result under the digest of all its
     inputs; then transformers, which takes seconds to import, is not needed again. Raises `VLMError`
-    where the checkpoint is incomplete or `vlm.layers` goes past it.
+    where the checkpoint is incomplete, `vlm.layers` goes past it, or a projection is wider than it.
     """
     folder = resolve_checkpoint(vlm.checkpoint, vlm.revision)
     ordered = tuple(sorted(set(views)))
@@ -111,16 +136,34 @@ def feature_spec(
         "slots": slot_documents(slots, vlm.variants),
         "dim": dim,
         "compute_dtype": vlm.dtype,
-        "storage_dtype": storage_dtype,
+        "storage_dtype": stored_as(dtype),
         **_augmentation(vlm),
     }
     digest = _digest(document)
     image_size = processor["image_size"][0], processor["image_size"][1]
-    return FeatureSpec(document, digest, slots, ordered, dim, image_size, vlm.variants)
+    spec = FeatureSpec(document, digest, slots, ordered, dim, image_size, vlm.variants)
+    if not isinstance(dtype, PCA):
+        return spec
+    if dtype.pca > dim:
+        raise VLMError(
+            f"extract.dtype {dtype}: the hidden states of {vlm.checkpoint} have only {dim} "
+            f"numbers. Set pca to at most {dim}."
+        )
+    document = document | {"dim": dtype.pca, "pca": {"of": dim, "basis": None}}
+    projected = replace(
+        spec, document=document, digest=_digest(document), dim=dtype.pca, whole=spec
+    )
+    return projected if basis is None else projected.on(basis)
+
+
+def dtype_of(spec: Mapping[str, Any]) -> FeatureDtype:
+    """The value of `extract.dtype` that gave a stored spec."""
+    stored = spec["storage_dtype"]
+    return PCA(pca=spec["dim"], then=stored) if "pca" in spec else stored
 
 
 def feature_shape(vlm: VLMParams, views: Sequence[str]) -> tuple[int, int]:
-    """(slots, width) of the features; for a hub id the width is that of Qwen2.5-VL-3B.
+    """(slots, width) of the features; for a hub id width and layers are those of Qwen2.5-VL-3B.
 
     Raises `VLMError` for a checkpoint that is neither a folder nor a hub id, also for a name whose
     parent is a folder here but that does not exist.
@@ -131,9 +174,11 @@ def feature_shape(vlm: VLMParams, views: Sequence[str]) -> tuple[int, int]:
         from pipeline.vlm.processor import PixelSettings
 
         tokens = PixelSettings.of(vlm).merged_grid
-    slots = len(slots_of(vlm, _MANY_LAYERS, views, tokens))
-    if folder:
-        return slots, read_config(folder).text_config.hidden_size
+    text = read_config(folder).text_config if folder else None
+    every = text.num_hidden_layers if text else _LAYERS_OF_3B
+    slots = len(slots_of(vlm, every if vlm.layers == "all" else _MANY_LAYERS, views, tokens))
+    if text:
+        return slots, text.hidden_size
     if folder_here(str(Path(vlm.checkpoint).parent)) or not could_be_hub_id(vlm.checkpoint):
         raise VLMError(
             f"{vlm.checkpoint}: no such folder, and no hub id. The demo's checkpoint is written by "

@@ -12,11 +12,12 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from pipeline.base.config import TuningParams, VLMParams
+from pipeline.base.config import PCA, TuningParams, VLMParams
 from pipeline.base.digests import file_digest
 from pipeline.base.errors import CheckpointMismatch, VLMError
 from pipeline.base.files import disk_full_named, sync
 from pipeline.base.hardware import resolve_device
+from pipeline.base.projection import Basis
 from pipeline.base.text import capped
 from pipeline.vlm.checkpoint_folder import resolve_checkpoint
 from pipeline.vlm.feature_spec import FeatureSpec, feature_spec, live_differences
@@ -33,12 +34,14 @@ _COMPANIONS = ("*config.json", "chat_template.*", "*token*.json", "vocab.json", 
 """The files of a checkpoint folder besides its weights."""
 
 
-def live_spec(vlm: VLMParams, views: Sequence[str]) -> FeatureSpec:
+def live_spec(vlm: VLMParams, views: Sequence[str], basis: Basis | None = None) -> FeatureSpec:
     """The spec of the features of a live model of `vlm`; reads every file for its digest.
 
-    These features are not stored: compare the spec with that of stored ones by `live_differences`.
+    A `basis` projects them. They are not stored: compare the spec with that of stored ones by
+    `live_differences`.
     """
-    return feature_spec(vlm, "float32", views, file_digest)
+    dtype = "float32" if basis is None else PCA(pca=basis.maps.shape[2], then="float32")
+    return feature_spec(vlm, dtype, views, file_digest, basis=basis)
 
 
 def refuse_other_features(vlm: VLMParams, trained: Mapping[str, Any], live: FeatureSpec) -> None:
@@ -113,7 +116,7 @@ class LiveVLM(nn.Module):
             # Image tokens are written into the embeddings in place, which a leaf that requires
             # gradients would refuse; non-reentrant checkpoints need no such input.
             inner.disable_input_require_grads()
-        extractor = Extractor(inner, PixelSettings.of(vlm), spec.slots)
+        extractor = Extractor(inner, PixelSettings.of(vlm), spec.slots, basis=spec.basis)
         return cls(model.to(target), extractor, spec, vlm, tuning)
 
     def forward(

@@ -20,6 +20,7 @@ from pipeline.base.config import Layer, VLMParams
 from pipeline.base.errors import NumericsError, VLMError
 from pipeline.base.hardware import resolve_device
 from pipeline.base.packing import Stored, pack, scales
+from pipeline.base.projection import Basis, group_sizes
 from pipeline.vlm.collation import Collator, TokenBatch
 from pipeline.vlm.feature_spec import FeatureSpec
 from pipeline.vlm.loading import environment, load_model
@@ -51,8 +52,9 @@ class Extractor:
         settings: PixelSettings,
         slots: tuple[Slot, ...],
         compiled: bool = False,
+        basis: Basis | None = None,
     ) -> None:
-        """`model` may be cut after the last layer that a slot reads.
+        """`model` may be cut after the last layer that a slot reads; `basis` projects the slots.
 
         With `compiled`, vision and text are each compiled completely, for static shapes.
         """
@@ -64,6 +66,8 @@ class Extractor:
         places = slots[: len(slots) // len(self._reads)]
         self._tower = VisionTower(model.visual, settings.grid)
         self._collator = Collator(model, settings, places, self._tower, static=compiled)
+        self._groups = group_sizes([slot.document() for slot in slots])
+        self._maps = None if basis is None else torch.tensor(basis.maps, device=model.device)
         self._compiled: tuple[Callable[..., Tensor], ...] = ()
         if compiled:
             from torch._dynamo import config  # takes a second to import
@@ -104,7 +108,20 @@ class Extractor:
             seen = see(patches, batch.plan).index_select(0, batch.shown)
             embedded.flatten(0, 1).index_copy_(0, places.image_tokens, seen.to(embedded.dtype))
         masks = self._masks(embedded)
-        return read(embedded, places.positions, masks, places.weights, places.real)
+        whole = read(embedded, places.positions, masks, places.weights, places.real)
+        return whole if self._maps is None else self._projected(whole, self._maps, places.weights)
+
+    def _projected(
+        self,
+        whole: Float[Tensor, "batch slot channel"],
+        maps: Float[Tensor, "group input dim"],
+        weights: Float[Tensor, "batch place token"],
+    ) -> Float[Tensor, "batch slot dim"]:
+        """The slots on the basis; those without tokens stay zero."""
+        there = weights.any(dim=-1).repeat(1, len(self._reads)).unsqueeze(-1)
+        with torch.autocast(whole.device.type, enabled=False):
+            parts = zip(whole.split(self._groups, dim=1), maps, strict=True)
+            return torch.cat([part @ a[:-1] + a[-1] for part, a in parts], dim=1) * there
 
     def _masks(self, embedded: Float[Tensor, "batch token dim"]) -> Mapping[str, Tensor | None]:
         """The mask of each kind of layer; None where the kernel itself is causal.
@@ -202,7 +219,8 @@ class FrozenVLM:
         self._model = model
         if model.device.type == "cuda":
             pad_mlps(model.visual)
-        self._extractor = Extractor(model, settings, spec.slots, compiled)
+        assert not spec.unfitted, "a projection needs its basis"
+        self._extractor = Extractor(model, settings, spec.slots, compiled, spec.basis)
         self._spec = spec
         self._storage_dtype: str = spec.document["storage_dtype"]
         self._compiled = compiled

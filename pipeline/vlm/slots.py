@@ -4,7 +4,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -106,7 +106,9 @@ def layer_name(layer: Layer, norm: bool) -> str:
     return "vision tower" if layer == "vision" else f"layer {layer}{'' if norm else ', no norm'}"
 
 
-def _resolved_layers(layers: Sequence[Layer], count: int) -> tuple[Layer, ...]:
+def _resolved_layers(layers: Sequence[Layer] | Literal["all"], count: int) -> tuple[Layer, ...]:
+    if layers == "all":
+        return tuple(range(count))
     resolved: list[Layer] = [
         layer + count if isinstance(layer, int) and layer < 0 else layer for layer in layers
     ]

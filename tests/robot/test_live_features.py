@@ -1,5 +1,6 @@
 """Live features are those of the store; another model is refused with the reason."""
 
+import json
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import replace
@@ -10,16 +11,17 @@ import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
-from pipeline.base.config import Params
-from pipeline.base.errors import CheckpointMismatch
+from pipeline.base.config import Params, load_params
+from pipeline.base.errors import CheckpointIncomplete, CheckpointMismatch
 from pipeline.data import open_recordings
-from pipeline.policy.checkpoint import PolicyCheckpoint
+from pipeline.policy.checkpoint import BASIS, PolicyCheckpoint, load_policy
 from pipeline.robot.live_features import LiveFeatures, prove
 from pipeline.store import FeatureStore
 from pipeline.vlm.demo_checkpoint import write_demo_checkpoint
 from pipeline.vlm.live import LiveVLM
 from pipeline.vlm.preparation import Preparer
 from pipeline.vlm.slots import TOLERANCES
+from stages import extract, train_head
 
 Frames = Mapping[str, np.ndarray]
 
@@ -154,3 +156,33 @@ def test_half_precision_tolerates_its_own_noise_and_no_more(params, checkpoint, 
 
     assert proven(replace(stored, golden=rounded(1.0)), live)[2] == 5e-2
     assert "golden rows are not" in refusal(replace(stored, golden=rounded(1.3)), live)
+
+
+def test_a_checkpoint_carries_the_basis_on_which_live_features_are_projected(
+    params, trained_once, tmp_path, capsys
+):
+    changed = {
+        "extract.store": str(tmp_path / "few.zarr"),
+        "extract.dtype": {"pca": 16, "then": "int8"},
+        "train_head.output": str(tmp_path / "head"),
+        "train_head.logs": str(tmp_path / "logs"),
+    }
+    few = load_params(
+        trained_once, [f"{key}={json.dumps(value)}" for key, value in changed.items()]
+    )
+    for stage in (extract, train_head):
+        stage.main(few)
+    assert "16 main directions of 128 numbers; the checkpoint carries" in capsys.readouterr().out
+    folder = tmp_path / "head" / "best"
+    checkpoint = load_policy(folder)
+    assert checkpoint.basis is not None
+    live = LiveFeatures(params.vlm, checkpoint.source["feature_spec"], "cpu", checkpoint.basis)
+    said: list[str] = []
+    prove(checkpoint, live, said.append)
+    assert "golden rows computed again" in said[0]
+    with pytest.raises(CheckpointMismatch, match="pca"):
+        LiveFeatures(params.vlm, checkpoint.source["feature_spec"], "cpu")
+
+    save_file({"maps": torch.from_numpy(checkpoint.basis.maps + 1)}, folder / BASIS)
+    with pytest.raises(CheckpointIncomplete, match="its digest is not"):
+        load_policy(folder)

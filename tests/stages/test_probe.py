@@ -12,6 +12,7 @@ import zarr
 from pipeline.base.files import MARKER
 from pipeline.store import FeatureStore
 from pipeline.store.chunks import write_seal
+from pipeline.store.proofs import find_proof
 from stages import probe
 from stages.command import run
 
@@ -117,3 +118,27 @@ def test_a_damaged_store_is_refused(params, tiny_store, tmp_path, capsys):
     assert "stages.verify" in error
     assert not (params.parent / "report" / "metrics.json").exists()
     assert run("", probe.main, arguments) == 0
+
+
+def test_what_a_type_would_lose_is_kept_beside_the_store(
+    params: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arguments = ["--params", str(params), "--set", "probe.codecs=[int8, {pca: 4}]"]
+    assert run("", probe.main, arguments) == 0
+    file = params.parent / "tiny.zarr.proofs.json"
+    assert f"{file}: what these types lose" in capsys.readouterr().out
+    spec = FeatureStore.open(params.parent / "tiny.zarr").spec
+    proof = find_proof(params.parent, spec | {"storage_dtype": "int8"})
+    assert proof is not None
+    assert proof.recordings == 12
+    assert [loss.of for loss in proof.losses] == ["layer 3, mean", "layer 3, grid"]
+    few = spec | {"storage_dtype": "int8", "dim": 4, "pca": {"of": 8, "basis": "any"}}
+    assert find_proof(params.parent, few) is not None
+
+
+def test_without_the_model_passes_are_not_timed(
+    params: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run("", probe.main, ["--params", str(params), "--set", "probe.time=true"]) == 0
+    assert "not timed: " in (said := capsys.readouterr().out)
+    assert "s a pass" not in said

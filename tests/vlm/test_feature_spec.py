@@ -11,6 +11,7 @@ from pipeline.base.differences import differences
 from pipeline.base.errors import VLMError
 from pipeline.vlm.checkpoint_folder import resolve_checkpoint, weight_files
 from pipeline.vlm.feature_spec import (
+    feature_shape,
     feature_spec,
 )
 from pipeline.vlm.slots import Slot
@@ -53,6 +54,12 @@ def test_slots_go_by_layer_norm_pooling(spec_of):
     assert spec.slots[:2] == (Slot(3, True, "mean"), Slot(3, True, "view_mean", "View1"))
     assert spec.slots[8] == Slot(3, True, "grid", "View1", (1, 1))
     assert spec.slots[35:71:35] == (Slot(3, False, "mean"), Slot(1, True, "mean"))
+
+
+def test_all_layers_are_named_in_a_word(spec_of, vlm_params):
+    assert spec_of(layers="all") == spec_of(layers=[0, 1, 2, 3])
+    assert feature_shape(vlm_params(layers="all"), VIEWS) == (4, 128)
+    assert feature_shape(vlm_params(layers="all", checkpoint="owner/name"), VIEWS) == (36, 2048)
 
 
 def test_grids_tokens_and_the_tower_stand_side_by_side(spec_of):

@@ -10,9 +10,11 @@ keys and reads files.
 # pyright: reportUnusedImport=false
 
 from pipeline.base.config.extraction import (
+    PCA,
     AugmentationParams,
     DataParams,
     ExtractParams,
+    FeatureDtype,
     GridPooling,
     InspectParams,
     Layer,
@@ -22,6 +24,7 @@ from pipeline.base.config.extraction import (
     Source,
     StoresParams,
     VLMParams,
+    stored_as,
 )
 from pipeline.base.config.params import Params, described_keys, load_params, load_section, setting
 from pipeline.base.config.policies import (

@@ -25,6 +25,37 @@ Layer = int | Literal["vision"]
 """Index of a decoder layer, or the vision tower."""
 
 
+Layers = Annotated[
+    Annotated[Literal["all"], Tag("all")]
+    | Annotated[tuple[Layer, ...], Field(min_length=1, max_length=1000), Tag("some")],
+    Discriminator(lambda value: "all" if isinstance(value, str) else "some"),
+]
+"""Some layers, or every decoder layer."""
+
+
+class PCA(Section):
+    """Fewer numbers a slot: its coefficients on the main directions of some of the features."""
+
+    pca: int = Field(ge=1, le=65_536)
+    """How many; at most the width of the model's hidden states."""
+    then: StorageDtype = "int8"
+    """The type in which they are stored."""
+
+    def __str__(self) -> str:
+        return f"pca {self.pca} in {self.then}"
+
+
+FeatureDtype = Annotated[
+    Annotated[StorageDtype, Tag("name")] | Annotated[PCA, Tag("pca")],
+    Discriminator(lambda value: "name" if isinstance(value, str) else "pca"),
+]
+
+
+def stored_as(dtype: StorageDtype | PCA) -> StorageDtype:
+    """The type of the numbers that are stored."""
+    return dtype.then if isinstance(dtype, PCA) else dtype
+
+
 class GridPooling(Section):
     """A grid of its own size, so that several stand side by side."""
 
@@ -182,9 +213,9 @@ class VLMParams(Section):
     """Pixels; rounded to a size that the processor accepts (640 -> 644)."""
     prompt: str = "{instruction}\n{images}\n{instruction}"
     """Template of one user turn. Attention is causal: images see only the text before them."""
-    layers: tuple[Layer, ...] = Field(default=(-1,), min_length=1, max_length=1000)
-    """Decoder layers whose output is taken; 0 is the first, -1 the last. vision: the output of the
-    vision tower; alone, the language model does not run."""
+    layers: Layers = (-1,)
+    """Decoder layers whose output is taken; 0 is the first, -1 the last; or all. vision: the output
+    of the vision tower; alone, the language model does not run."""
     norms: tuple[bool, ...] = Field(default=(True,), min_length=1, max_length=2)
     """Whether the model's final norm is applied to a layer's output; [true, false] stores both."""
     pooling: tuple[Pooling, ...] = Field(default=("mean", "grid"), min_length=1, max_length=16)
@@ -214,9 +245,10 @@ class ExtractParams(Section):
 
     store: Output = Path("cache_store/demo.zarr")
     """The store, whose name ends in .zarr; written once, then never modified."""
-    dtype: StorageDtype = "float32"
+    dtype: FeatureDtype = "float32"
     """Type of the stored features. float8 and int8 take a quarter of float32, with scales of their
-    own; stages.probe with `probe.codecs` says what each loses."""
+    own. `{pca: 128, then: int8}` keeps 128 numbers a slot, on the main directions of a sample of
+    rows, in int8. stages.probe with `probe.codecs` says what each loses."""
     sensor_dtype: Literal["float32", "float16"] = "float32"
     """Type of the stored sensor stream."""
     batch_size: Literal["auto"] | Annotated[int, Field(ge=1, le=10_000)] = "auto"
@@ -325,9 +357,11 @@ class ProbeParams(Section):
     """Sensor readings before the tick; their mean, last value and spread are the inputs."""
     state_window: int = Field(default=100, ge=1, le=20_000)
     """State readings before the tick, used in the same way."""
-    codecs: tuple[StorageDtype, ...] = ()
+    codecs: tuple[FeatureDtype, ...] = ()
     """Also say what these values of `extract.dtype` would lose: the error of the numbers, and the
     difference in R2. Run it on a store in float32."""
+    time: bool = False
+    """Also load the model of `vlm` and say how long a pass takes that stops after each layer."""
     threads: int = Field(default=2, ge=1, le=256)
     """Threads, each of which works on its own slot."""
     check_store: bool = True

@@ -1,8 +1,8 @@
 """Every slot and group of slots, scored by a linear regression from it to the action chunk."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
@@ -12,9 +12,11 @@ from pydantic import TypeAdapter
 from threadpoolctl import threadpool_limits
 from tqdm import tqdm
 
-from pipeline.base.config import ProbeParams
-from pipeline.base.errors import NumericsError, StoreMismatch
+from pipeline.base.arrays import widen
+from pipeline.base.config import PCA, FeatureDtype, ProbeParams, stored_as
+from pipeline.base.errors import ConfigError, NumericsError, StoreMismatch
 from pipeline.base.packing import pack, unpack
+from pipeline.base.projection import apply_map, fit_map
 from pipeline.evaluate.figures import Figure
 from pipeline.evaluate.probe.inputs import (
     Inputs,
@@ -26,13 +28,16 @@ from pipeline.evaluate.probe.inputs import (
 )
 from pipeline.evaluate.probe.ridge import ProbeFolds, ProbeScore, cross_validate, fold_by_recording
 from pipeline.policy.normalization import fit_channels
-from pipeline.store import FeatureStore
+from pipeline.store import FEATURES, FeatureStore
+from pipeline.train.batches import evenly
 from pipeline.train.statistics import check_finite
 
 _MOST_SINGLE = 300
 """Most slots that are scored one by one."""
 _ROUNDING_SHARE = 1e-5
 """A spread below this share of a channel's size is rounding: the channel does not vary."""
+_SAMPLE = 4096
+"""Most features to which a projection is fitted, as in an extraction."""
 _ROUNDING = 1e-9
 """A gain below this counts as none."""
 
@@ -97,6 +102,8 @@ class ProbeStudy:
     """In the store's order; of many hundred slots only those that are a group of their own."""
     groups: tuple[ProbeResult, ...]
     codecs: tuple[CodecResult, ...] = ()
+    seconds: Mapping[int, float] = field(default_factory=dict)
+    """Depth (`depth`) -> s of a pass of one row that stops there; empty where not measured."""
 
     @property
     def baseline(self) -> Known:
@@ -143,10 +150,15 @@ def probe(store: FeatureStore, params: ProbeParams) -> ProbeStudy:
             f"probe.codecs: expected a store in float32, from which other types are judged, found "
             f"{stored} in {store.path}. Extract it with extract.dtype float32, some recordings do"
         )
+    slots, dim = store.feature_shape
+    if any(isinstance(codec, PCA) and codec.pca > dim for codec in params.codecs):
+        raise ConfigError(
+            f"probe.codecs: the features of {store.path} have only {dim} numbers. Set pca to at "
+            f"most {dim}."
+        )
     action = store.array("tick/action")
     check_finite(store, "tick", range(store.ticks), "actions", action)
     folds = fold_by_recording(store, params.folds, params.horizon, params.max_ticks, params.repeats)
-    slots, dim = store.feature_shape
     names = TypeAdapter(list[SlotName]).validate_python(store.attrs["slots"][:slots])
     singles = {(index,): name for index, name in enumerate(names)}
     groups = {
@@ -166,11 +178,14 @@ def probe(store: FeatureStore, params: ProbeParams) -> ProbeStudy:
             inputs, targets, folds, params.penalties, penalties_of if beside else ()
         )
 
-    def coded(group: ProbeResult, codec: str) -> CodecResult:
+    def coded(group: ProbeResult, codec: FeatureDtype) -> CodecResult:
         squares: list[float] = []
+        rank = codec.pca if isinstance(codec, PCA) else dim
+        basis = _Projection(store, rows, group.slots, rank) if isinstance(codec, PCA) else None
 
         def change(values: Values) -> Values:
-            changed = unpack(pack(torch.from_numpy(values), codec)).float().numpy()
+            numbers = values if basis is None else apply_map(values, basis.affine)
+            changed = unpack(pack(torch.from_numpy(numbers), stored_as(codec))).float().numpy()
             if not np.isfinite(changed).all():
                 raise NumericsError(
                     f"probe.codecs {codec}: {group.name.label} has numbers up to "
@@ -179,14 +194,15 @@ def probe(store: FeatureStore, params: ProbeParams) -> ProbeStudy:
             spread = values.std(axis=0, dtype=np.float64)
             varies = spread > _ROUNDING_SHARE * np.abs(values).max(axis=0)
             if varies.any():
-                errors = (changed - values)[:, varies] / spread[varies]
+                again = changed if basis is None else basis.expand(changed)
+                errors = (again - values)[:, varies] / spread[varies]
                 squares.append(float(np.mean(errors**2)))
             return changed
 
         inputs, _ = read_slots(store, rows, fold[:, first], group.slots, change)
-        row_bytes = pack(torch.zeros(len(group.slots), dim), codec).nbytes
+        row_bytes = pack(torch.zeros(len(group.slots), rank), stored_as(codec)).nbytes
         error = float(np.sqrt(np.mean(squares or [0.0])))
-        return CodecResult(group, codec, row_bytes, error, score(inputs[of_tick]))
+        return CodecResult(group, str(codec), row_bytes, error, score(inputs[of_tick]))
 
     def result(own: tuple[int, ...]) -> ProbeResult:
         inputs, valid = read_slots(store, rows, fold[:, first], own)
@@ -226,6 +242,26 @@ def probe(store: FeatureStore, params: ProbeParams) -> ProbeStudy:
         groups=tuple(results[own] for own in groups),
         codecs=codecs,
     )
+
+
+class _Projection:
+    """The projection of a group's features that extraction would fit, and the way back."""
+
+    def __init__(
+        self, store: FeatureStore, rows: NDArray[np.int64], slots: Sequence[int], rank: int
+    ) -> None:
+        """Fitted on some of the valid slots of these VL rows, evenly spread."""
+        valid = store.array("vl/slot_valid")[rows][:, list(slots)] != 0
+        row, slot = np.nonzero(valid)
+        chosen = evenly(np.arange(len(row)), _SAMPLE)
+        values = widen(store.array(FEATURES)[rows[row[chosen]], np.array(slots)[slot[chosen]]])
+        self.affine, _ = fit_map(values, rank)
+        self._mean, self._spread = values.mean(axis=0), values.std(axis=0, dtype=np.float64)
+        self._back = np.linalg.pinv(self.affine[:-1] * self._spread[:, None])
+
+    def expand(self, numbers: Values) -> Values:
+        """The features whose coefficients these are, in standardised channels the nearest."""
+        return self._mean + (numbers @ self._back) * self._spread
 
 
 def _known_blocks(

@@ -8,7 +8,8 @@ import numpy as np
 
 from pipeline.base.files import write_document
 from pipeline.base.text import Table
-from pipeline.evaluate.probe.study import ProbeResult, ProbeStudy, ranked, recommend
+from pipeline.evaluate.probe.study import ProbeResult, ProbeStudy, depth, ranked, recommend
+from pipeline.store.proofs import Loss, Proof
 
 TOP = 12
 """The most slots that are printed; the tables have all."""
@@ -53,6 +54,8 @@ def metrics(study: ProbeStudy) -> dict[str, Any]:
             "error_std": result.error,
             "difference": result.difference.document("r2"),
         }
+    if study.seconds:
+        document["pass_s"] = {str(layer): s for layer, s in study.seconds.items()}
     advised = recommend(study)
     if advised is not None:
         document["recommended"] = {
@@ -79,8 +82,13 @@ def ranking(study: ProbeStudy) -> Table:
         rows.append([result.name.label + several, result.inputs, f"{result.valid_share:.0%}", size])
         figures = (result.alone.r2, result.beside.r2, study.gain(result))
         rows[-1] += [figure.text("+") for figure in figures]
+        if study.seconds:
+            rows[-1].append(f"{study.seconds[depth(result.name)]:.3g}")
     heads = ["what is read", "gain", "R2 beside", "R2 alone", "inputs", "valid", "bytes a row"]
     order = (0, 6, 5, 4, 1, 2, 3)
+    if study.seconds:
+        heads, order = [*heads, "s a pass"], (*order, 7)
+        rows = [[*row, None][:8] for row in rows]
     return Table(heads, [[row[place] for place in order] for row in rows])
 
 
@@ -100,6 +108,17 @@ def codec_table(study: ProbeStudy) -> Table:
     return Table(heads, rows)
 
 
+def proofs(study: ProbeStudy) -> dict[str, Proof]:
+    """The verdict on each codec, for the file beside the store."""
+    losses: dict[str, list[Loss]] = {}
+    for result in study.codecs:
+        figures = {"error_std": result.error, **result.difference.document("r2")}
+        loss = Loss.model_validate({"of": result.of.name.label, **figures})
+        losses.setdefault(result.codec, []).append(loss)
+    of = {"recordings": study.folds.recordings, "ticks": len(study.folds.ticks)}
+    return {codec: Proof(**of, losses=own) for codec, own in losses.items()}
+
+
 def notes(study: ProbeStudy) -> list[str]:
     """What a reader of the ranking has to know."""
     single = sum(result.name != result.name.group for result in study.slots)
@@ -114,6 +133,8 @@ def notes(study: ProbeStudy) -> list[str]:
         "inputs fewer than channels are their main directions over all folds",
         "valid: the share of ticks that have a slot; elsewhere its mean is read",
     ]
+    if study.seconds:
+        lines.append("s a pass: of the model on one row, up to that layer, frames prepared before")
     if not study.slots:
         lines.append("single slots are too many to be scored one by one")
     if single > TOP:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from pipeline.base.config import ProbeParams
-from pipeline.base.errors import NumericsError
+from pipeline.base.errors import ConfigError, NumericsError
 from pipeline.evaluate.probe.inputs import SlotName
 from pipeline.evaluate.probe.ridge import ProbeFolds, ProbeScore
 from pipeline.evaluate.probe.study import (
@@ -63,9 +63,10 @@ def test_a_codec_is_judged_by_its_error_and_by_what_it_costs(
     weights = np.random.default_rng(1).normal(size=(8, 4)).astype(np.float32)
     small = features / features.std(axis=(0, 1))
     store.array("tick/action")[:, :4] = small[store.array("tick/vl_row"), 3] @ weights
-    study = probed(store, horizon=1, codecs=("float32", "float8", "int8"))
+    few = {"pca": 8, "then": "int8"}
+    study = probed(store, horizon=1, codecs=("float32", "float8", "int8", few))
     groups = len(study.groups)
-    float32, float8, int8 = (study.codecs[at::3] for at in range(3))
+    float32, float8, int8, pca = (study.codecs[at::4] for at in range(4))
     assert groups == len(float32) and all(result.error == 0 for result in float32)
     assert all(result.difference.value == 0 for result in float32)
     assert [result.row_bytes for result in (*float32, *float8)] == groups * [5 * 8 * 4] + groups * [
@@ -75,8 +76,20 @@ def test_a_codec_is_judged_by_its_error_and_by_what_it_costs(
     assert all(0 < result.error < 0.06 for result in float8)
     assert all(result.error > 0.5 for result in int8)
     assert all(result.difference.value < -0.2 for result in int8)
+    # Each channel was standardised before, so that the huge one costs the others nothing.
+    assert all(0 < result.error < 0.03 for result in pca)
+    assert all(abs(result.difference.value) < 0.01 for result in pca)
+    assert {result.codec for result in pca} == {"pca 8 in int8"}
+    fewer = probed(store, horizon=1, codecs=({"pca": 2, "then": "float32"},)).codecs
+    assert all(0.5 < result.error < 1 and result.row_bytes == 5 * 2 * 4 for result in fewer)
+    with pytest.raises(ConfigError, match="Set pca to at most 8"):
+        probed(store, codecs=({"pca": 9},))
     assert metrics(study)["codecs"][study.groups[0].name.label]["int8"]["row_bytes"] == 50
     assert "R2 minus stored" in table(study)
+    assert "s a pass" not in table(study)
+    timed = replace(study, seconds={0: 0.0123})
+    assert "s a pass" in table(timed) and "0.0123" in table(timed)
+    assert metrics(timed)["pass_s"] == {"0": 0.0123}
 
 
 @pytest.fixture
