@@ -39,6 +39,7 @@ from tqdm import tqdm
 
 from experiments.recipes import (
     AS_IT_IS,
+    EIGHT_BITS,
     LATE,
     NEWEST,
     NOT_ANCHORED,
@@ -46,7 +47,6 @@ from experiments.recipes import (
     PATCHES,
     RECIPES,
     ROLLOUTS,
-    SLOTS,
     STORES,
     TABLES,
     Table,
@@ -218,6 +218,8 @@ def _rows(
     for controller, ended in episodes.items():
         miss = float(np.median([float(row["lateral_mm"]) for row in ended]))
         figures = {"success": _success(ended), "lateral_mm": [round(miss, 3)]}
+        if controller == POLICY:
+            figures["by_training"] = _by_training(folders, rollout)
         if controller == POLICY and rollout == TABLES[wanted.table].rollouts[0]:
             figures |= _errors_beside(wanted, folders)
         others = [] if controller == POLICY else [controller]
@@ -273,6 +275,12 @@ def _figure(errors: NDArray[Any], counts: NDArray[Any]) -> list[float]:
 def _success(episodes: list[dict[str, str]]) -> list[float]:
     rate = SuccessRate.of([row["success"] == "True" for row in episodes])
     return [round(number, 3) for number in (rate.rate, rate.low, rate.high)]
+
+
+def _by_training(folders: list[Path], rollout: str) -> list[float]:
+    """The success of each training that was rolled out."""
+    ended = (_episodes([folder / rollout]).get(POLICY) for folder in folders)
+    return [_success(episodes)[0] for episodes in ended if episodes]
 
 
 def _policies(out: Path) -> Iterator[dict[str, Any]]:
@@ -357,7 +365,10 @@ def _draw_staleness(wanted: Namespace) -> None:
 
 
 def _draw_size(wanted: Namespace) -> None:
-    """Success with its interval against the bytes of a row, a point for what is kept and read."""
+    """Success with its interval against the bytes of a row, a point for what is kept and read.
+
+    Squares are read by a pooler, triangles are of eight bits, hollow points have one training.
+    """
     from pipeline.look.page import style
 
     points: dict[str, dict[str, Any]] = {}
@@ -368,6 +379,7 @@ def _draw_size(wanted: Namespace) -> None:
             store = FeatureStore.open(load_params(Path("params.yaml"), told).extract.store)
             row_bytes = store.array("vl/features")[:1].nbytes
             points[name] = {"row_bytes": row_bytes, "success": _success(episodes)}
+            points[name] |= {"by_training": _by_training(folders, ON_TIME)}
     if not points:
         raise SystemExit(f"{wanted.out}: nothing to draw. Make the table `slots` there first.")
 
@@ -375,17 +387,18 @@ def _draw_size(wanted: Namespace) -> None:
         figure, panels = style.panels(9.0, 4.4, 1, 1)
         for index, (name, point) in enumerate(points.items()):
             rate, low, high = (100 * number for number in point["success"])
-            marker = "s" if "pooler" in name else "^" if name in SLOTS and "8" in name else "o"
+            marker = "s" if "pooler" in name else "^" if name in EIGHT_BITS else "o"
             panels.errorbar(
                 point["row_bytes"],
                 rate,
                 [[rate - low], [high - rate]],
                 fmt=marker,
+                fillstyle="full" if len(point["by_training"]) > 1 else "none",
                 color=style.PALETTE[index % len(style.PALETTE)],
                 label="mean, grid 4x4" if name == AS_IT_IS else name,
             )
         panels.set(xscale="log", xlabel="kB of a VL row's features", ylabel="inserted [%]")
-        panels.set_xticks([500, 2000, 5000, 20_000, 50_000], ["0.5", "2", "5", "20", "50"])
+        panels.set_xticks([500, 2000, 5000, 20_000, 100_000], ["0.5", "2", "5", "20", "100"])
         panels.minorticks_off()
         panels.legend(fontsize="small", loc="center left", bbox_to_anchor=(1.0, 0.5))
         return figure

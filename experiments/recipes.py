@@ -79,6 +79,7 @@ SLOTS: dict[str, tuple[str, ...]] = {
     "tokens of the vision tower": ("vlm.pooling=[tokens]", "vlm.layers=[vision]"),
 }
 """What a store keeps of the demo's recordings, beside the demo's own mean and grid."""
+EIGHT_BITS = ("int8", "float8")
 
 
 def _store_of(name: str) -> Store:
@@ -222,7 +223,7 @@ RECIPES = {
     AS_IT_IS: Recipe(),
     # slots and their readers
     **{name: Recipe(store=name) for name in ("mean", "grid 2x2", "grid 8x8", "tokens")},
-    **{name: Recipe(store=name) for name in ("int8", "float8")},
+    **{name: Recipe(store=name) for name in EIGHT_BITS},
     "history of 3": Recipe(("train_head.feature_history=3",)),
     "grid, pooler": Recipe(_POOLER),
     "tokens, read as a mean": Recipe(("train_head.feature_encoder.kind=mean",), store="tokens"),
