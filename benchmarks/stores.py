@@ -1,7 +1,9 @@
 """Large synthetic stores, written by the project's own writer."""
 
 import json
+from itertools import product
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,13 +25,19 @@ def write_store(
     states: int,
     reuse: int = 3,
     slots: int = 1,
+    tokens: tuple[int, int] | None = None,
     dim: int = 2048,
     dtype: str = "float16",
     channels: int = 1026,
     state_dim: int = 7,
 ) -> Path:
-    """A finished store of random content; `ticks`, `readings` and `states` are an episode's."""
+    """A finished store of random content; `ticks`, `readings` and `states` are an episode's.
+
+    `tokens` are rows and columns of a view's tokens, which then are the slots.
+    """
     rows = -(-ticks // reuse)
+    named_slots = _named_slots(slots, tokens)
+    slots = len(named_slots)
     said = [json.dumps(_said(index)).encode() for index in range(episodes)]
     sizes = Sizes(
         episode=episodes,
@@ -55,7 +63,7 @@ def write_store(
     build.write("vl/slot_valid", 0, np.ones((sizes.vl_row, slots), np.uint8))
     for name in ("tick/action", "state/values", "sensor/values"):
         _write_random(build, name)
-    attributes = _attributes(channels, state_dim, reuse, slots)
+    attributes = _attributes(channels, state_dim, reuse, named_slots)
     build.finish_layout(attributes, {"slots": attributes["slots"]})
     _commit_random(build)
     build.seal()
@@ -89,11 +97,20 @@ def _layout(
     }
 
 
-def _attributes(channels: int, state_dim: int, reuse: int, slots: int) -> dict[str, object]:
+def _named_slots(slots: int, tokens: tuple[int, int] | None) -> list[dict[str, Any]]:
+    layer = {"layer": 0, "norm": True}
+    if tokens is None:
+        return [layer | {"pooling": "mean"}] * slots
+    cells = product(*map(range, tokens))
+    return [layer | {"pooling": "tokens", "view": "View1", "cell": [*cell]} for cell in cells]
+
+
+def _attributes(
+    channels: int, state_dim: int, reuse: int, named_slots: list[dict[str, Any]]
+) -> dict[str, object]:
     def named(prefix: str, width: int) -> dict[str, list[str]]:
         return {"names": [f"{prefix}_{i}" for i in range(width)], "units": [""] * width}
 
-    named_slots = [{"layer": 0, "norm": True, "pooling": "mean"}] * slots
     return {
         "schema": SCHEMA,
         "feature_spec": {"digest": "synthetic", "views": ["View1"], "slots": named_slots},

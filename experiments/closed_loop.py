@@ -11,7 +11,8 @@ policies; rollouts of another number of episodes are done again.
 
 `worth`, `staleness` and `size` run nothing. They draw what is in FOLDER: success against errors on
 recordings, a point a policy; success against what a pass of the model takes (tables `latency`,
-`before` and `many`); and success against the bytes of a VL row (tables `slots` and `bytes`).
+`before` and `many`); and success against the bytes of a VL row (tables `slots` and `bytes`). `pace`
+trains a few steps of each recipe of `size` in turn, and says how fast.
 
 The last line is JSON: of each row success with Wilson's interval over the rollouts of all seeds,
 and the errors in training std over all seeds and their differences from the table's first row
@@ -22,6 +23,7 @@ import csv
 import json
 import os
 import sys
+import time
 from argparse import ArgumentParser, Namespace
 from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor, as_completed
@@ -29,16 +31,19 @@ from contextlib import ExitStack
 from itertools import product
 from pathlib import Path
 from subprocess import run
+from tempfile import TemporaryDirectory
 from typing import Any
 from unittest.mock import patch
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from scipy.stats import spearmanr
 from tqdm import tqdm
 
 from experiments.recipes import (
     AS_IT_IS,
+    EIGHT_BITS,
     LATE,
     NEWEST,
     NOT_ANCHORED,
@@ -46,7 +51,6 @@ from experiments.recipes import (
     PATCHES,
     RECIPES,
     ROLLOUTS,
-    SLOTS,
     STORES,
     TABLES,
     Table,
@@ -58,6 +62,8 @@ from pipeline.evaluate.rollouts import EXPERT, POLICY, SuccessRate
 from pipeline.store import FeatureStore
 
 FIGURES = ("executed", "overall")
+_STEPS, _ROUNDS = 5, 7
+"""Of a turn of `pace`, and turns that count."""
 _AS_IT_IS = (
     *(f"{key}=null" for key in ("train_head.store", "evaluate.store", "evaluate.checkpoint")),
     *("rollout.checkpoint=null", "rollout.environment=phantom", "rollout.level=full"),
@@ -66,6 +72,7 @@ _AS_IT_IS = (
 )
 """What a recipe or a rollout takes for granted, whatever params.yaml says."""
 _WRITE_PAGE = "pipeline.look.page.writing.write_report"
+_KEPT = tuple(dict.fromkeys((*TABLES["slots"].recipes, *TABLES["bytes"].recipes)))
 FIRST_SEED = 3_000_000
 """Of the rollouts; each seed of training has a thousand of its own."""
 
@@ -73,7 +80,7 @@ FIRST_SEED = 3_000_000
 def main() -> None:
     """Run what is not done, and print the table."""
     parser = ArgumentParser("experiments.closed_loop", description=(__doc__ or "").split("\n")[0])
-    parser.add_argument("table", choices=[*TABLES, "worth", "staleness", "size"])
+    parser.add_argument("table", choices=[*TABLES, "worth", "staleness", "size", "pace"])
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--seeds", type=int, default=2)
     parser.add_argument("--episodes", type=int, default=100)
@@ -89,6 +96,8 @@ def main() -> None:
         _draw_staleness(wanted)
     elif wanted.table == "size":
         _draw_size(wanted)
+    elif wanted.table == "pace":
+        _race_training(wanted.out)
     else:
         _refuse_other_params(wanted.out)
         _make_table(wanted, TABLES[wanted.table])
@@ -218,6 +227,8 @@ def _rows(
     for controller, ended in episodes.items():
         miss = float(np.median([float(row["lateral_mm"]) for row in ended]))
         figures = {"success": _success(ended), "lateral_mm": [round(miss, 3)]}
+        if controller == POLICY:
+            figures["by_training"] = _by_training(folders, rollout)
         if controller == POLICY and rollout == TABLES[wanted.table].rollouts[0]:
             figures |= _errors_beside(wanted, folders)
         others = [] if controller == POLICY else [controller]
@@ -273,6 +284,12 @@ def _figure(errors: NDArray[Any], counts: NDArray[Any]) -> list[float]:
 def _success(episodes: list[dict[str, str]]) -> list[float]:
     rate = SuccessRate.of([row["success"] == "True" for row in episodes])
     return [round(number, 3) for number in (rate.rate, rate.low, rate.high)]
+
+
+def _by_training(folders: list[Path], rollout: str) -> list[float]:
+    """The success of each training that was rolled out."""
+    ended = (_episodes([folder / rollout]).get(POLICY) for folder in folders)
+    return [_success(episodes)[0] for episodes in ended if episodes]
 
 
 def _policies(out: Path) -> Iterator[dict[str, Any]]:
@@ -357,17 +374,21 @@ def _draw_staleness(wanted: Namespace) -> None:
 
 
 def _draw_size(wanted: Namespace) -> None:
-    """Success with its interval against the bytes of a row, a point for what is kept and read."""
+    """Success with its interval against the bytes of a row, a point for what is kept and read.
+
+    Squares are read by a pooler, triangles are of eight bits, hollow points have one training.
+    """
     from pipeline.look.page import style
 
     points: dict[str, dict[str, Any]] = {}
-    for name in dict.fromkeys((*TABLES["slots"].recipes, *TABLES["bytes"].recipes)):
+    for name in _KEPT:
         folders = [_folder(wanted.out, name, seed) for seed in range(wanted.seeds)]
         if episodes := _episodes([folder / ON_TIME for folder in folders]).get(POLICY):
             told = store_settings(RECIPES[name], wanted.out)
             store = FeatureStore.open(load_params(Path("params.yaml"), told).extract.store)
             row_bytes = store.array("vl/features")[:1].nbytes
             points[name] = {"row_bytes": row_bytes, "success": _success(episodes)}
+            points[name] |= {"by_training": _by_training(folders, ON_TIME)}
     if not points:
         raise SystemExit(f"{wanted.out}: nothing to draw. Make the table `slots` there first.")
 
@@ -375,17 +396,18 @@ def _draw_size(wanted: Namespace) -> None:
         figure, panels = style.panels(9.0, 4.4, 1, 1)
         for index, (name, point) in enumerate(points.items()):
             rate, low, high = (100 * number for number in point["success"])
-            marker = "s" if "pooler" in name else "^" if name in SLOTS and "8" in name else "o"
+            marker = "s" if "pooler" in name else "^" if name in EIGHT_BITS else "o"
             panels.errorbar(
                 point["row_bytes"],
                 rate,
                 [[rate - low], [high - rate]],
                 fmt=marker,
+                fillstyle="full" if len(point["by_training"]) > 1 else "none",
                 color=style.PALETTE[index % len(style.PALETTE)],
                 label="mean, grid 4x4" if name == AS_IT_IS else name,
             )
         panels.set(xscale="log", xlabel="kB of a VL row's features", ylabel="inserted [%]")
-        panels.set_xticks([500, 2000, 5000, 20_000, 50_000], ["0.5", "2", "5", "20", "50"])
+        panels.set_xticks([500, 2000, 5000, 20_000, 100_000], ["0.5", "2", "5", "20", "100"])
         panels.minorticks_off()
         panels.legend(fontsize="small", loc="center left", bbox_to_anchor=(1.0, 0.5))
         return figure
@@ -393,6 +415,38 @@ def _draw_size(wanted: Namespace) -> None:
     (picture,) = style.write(wanted.out, {"success_bytes.png": draw})
     print(picture)
     print(json.dumps({"table": "size", "points": points}))
+
+
+def _race_training(out: Path) -> None:
+    """Steps of training a second of a core, of each recipe whose store is there, in turn."""
+    from benchmarks.timing import Race
+    from benchmarks.train_step import Contender
+    from pipeline.train.batches import Prefetch, Windows
+    from pipeline.train.loop import Trainer
+    from pipeline.train.run import TrainingRun
+    from pipeline.train.split import split_by_episode
+
+    torch.set_num_threads(1)
+    with TemporaryDirectory() as scratch, ExitStack() as stack:
+        contenders: dict[str, Contender] = {}
+        for name in _KEPT:
+            told = [*_AS_IT_IS, *store_settings(RECIPES[name], out), *RECIPES[name].params]
+            params = load_params(Path("params.yaml"), [*told, f"train_head.output={scratch}"])
+            if params.extract.store.exists():
+                head, store = params.train_head, FeatureStore.open(params.extract.store)
+                split = split_by_episode(store, head.split, head.horizon)
+                trainer = Trainer(store, head, split, TrainingRun(head.output, "new", (), {}))
+                parts, device = trainer.plan.parts_of(range(10**9)), torch.device("cpu")
+                feed = stack.enter_context(Prefetch(store, parts, Windows.of(head), device))
+                contenders[name] = Contender(trainer, feed, _STEPS)
+        seconds: dict[str, list[float]] = {name: [] for name in contenders}
+        for _, (name, contender) in product(range(1 + _ROUNDS), contenders.items()):
+            begun = time.process_time()
+            contender.run()
+            seconds[name].append(time.process_time() - begun)
+    race = Race({name: taken[1:] for name, taken in seconds.items()})
+    results, ratios = race.results({"steps": _STEPS}), race.ratios(AS_IT_IS)
+    print(json.dumps({"table": "pace", "core_seconds": results, "ratios": ratios}))
 
 
 if __name__ == "__main__":

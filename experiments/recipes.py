@@ -62,6 +62,7 @@ _MANY = (
 )
 _TUNED = ("vlm.adapter={out}/tuned/best/adapter", "extract.store={out}/tuned.zarr")
 _TUNING = ("finetune.output={out}/tuned", "finetune.logs={out}/tuned-logs")
+_POOLER = ("train_head.feature_encoder.kind=pooler",)
 LARGE_IMAGES = ("vlm.image_resize_height=224", "vlm.image_resize_width=392")
 _LARGE = (*LARGE_IMAGES, "extract.store={out}/large.zarr")
 
@@ -69,6 +70,7 @@ _TWO_LAYERS = "vlm.layers=[1, -1]"
 SLOTS: dict[str, tuple[str, ...]] = {
     "mean": ("vlm.pooling=[mean]",),
     "grid 2x2": ("vlm.pooling=[{{grid: [2, 2]}}]",),
+    "grid 8x8": ("vlm.pooling=[{{grid: [8, 8]}}]",),
     "tokens": ("vlm.pooling=[tokens]",),
     "tokens of two layers": ("vlm.pooling=[tokens]", _TWO_LAYERS),
     "int8": ("extract.dtype=int8",),
@@ -77,6 +79,7 @@ SLOTS: dict[str, tuple[str, ...]] = {
     "tokens of the vision tower": ("vlm.pooling=[tokens]", "vlm.layers=[vision]"),
 }
 """What a store keeps of the demo's recordings, beside the demo's own mean and grid."""
+EIGHT_BITS = ("int8", "float8")
 
 
 def _store_of(name: str) -> Store:
@@ -84,12 +87,25 @@ def _store_of(name: str) -> Store:
     return Store((("extract", settings),), settings)
 
 
+_TOKENS = _store_of("tokens")
+_TUNED_TOKENS = (
+    *("vlm.pooling=[tokens]", "vlm.adapter={out}/tuned-tokens/best/adapter"),
+    "extract.store={out}/tuned-tokens.zarr",
+)
+_TUNING_TOKENS = (
+    *(*_TOKENS.settings, *_POOLER),
+    *("finetune.output={out}/tuned-tokens", "finetune.logs={out}/tuned-tokens-logs"),
+)
+
 STORES = {
     "demo": Store(),
     **{name: _store_of(name) for name in SLOTS},
     # 428 recordings, of which about 300 are trained on.
     "many": Store((("demo", _MANY), ("extract", _MANY)), _MANY),
     "tuned": Store((("finetune", _TUNING), ("extract", _TUNED)), _TUNED),
+    "tuned tokens": Store(
+        (*_TOKENS.steps, ("finetune", _TUNING_TOKENS), ("extract", _TUNED_TOKENS)), _TUNED_TOKENS
+    ),
     "large": Store((("extract", _LARGE),), _LARGE),
 }
 
@@ -203,13 +219,11 @@ _RESIDUAL = {
     "pipeline.policy.policy.Policy.sample": _residual_sample,
 }
 
-_POOLER = ("train_head.feature_encoder.kind=pooler",)
-
 RECIPES = {
     AS_IT_IS: Recipe(),
     # slots and their readers
-    **{name: Recipe(store=name) for name in ("mean", "grid 2x2", "tokens")},
-    **{name: Recipe(store=name) for name in ("int8", "float8")},
+    **{name: Recipe(store=name) for name in ("mean", "grid 2x2", "grid 8x8", "tokens")},
+    **{name: Recipe(store=name) for name in EIGHT_BITS},
     "history of 3": Recipe(("train_head.feature_history=3",)),
     "grid, pooler": Recipe(_POOLER),
     "tokens, read as a mean": Recipe(("train_head.feature_encoder.kind=mean",), store="tokens"),
@@ -268,6 +282,7 @@ RECIPES = {
     "flow matching, 300 demonstrations": Recipe((*_300, *_FLOW_MATCHING), store="many"),
     # what sees
     "tuned model": Recipe(store="tuned"),
+    "tuned tokens, pooler": Recipe(_POOLER, store="tuned tokens"),
     "larger images": Recipe(store="large"),
 }
 
@@ -315,14 +330,19 @@ TABLES = {
             AS_IT_IS,
             "mean",
             "grid 2x2",
+            "tokens, pooler",
+            "tokens in int8, pooler",
+            "grid 8x8",
+            "tokens of the vision tower, pooler",
+            "tokens of two layers, pooler",
             "tokens",
             "tokens, read as a mean",
             "grid, pooler",
-            *(f"{name}, pooler" for name in SLOTS if "tokens" in name),
         )
     ),
     "bytes": Table((AS_IT_IS, "int8", "float8", "tokens in int8, pooler", "history of 3")),
     "model": Table((AS_IT_IS, "tuned model")),
+    "tuned tokens": Table(("tokens, pooler", "tuned tokens, pooler")),
     "images": Table((AS_IT_IS, "larger images")),
     "learning": Table((AS_IT_IS, "horizon 16", "not averaged")),
     "longer": Table(("four times as long", "flow matching, four times as long")),

@@ -131,6 +131,7 @@ class FeaturePooler(nn.Module):
     """Learned queries that attend to the slots: features (batch, slot, dim) -> (batch, query, dim).
 
     The slots of a place in all layers of a row become one key, by a learned mixture of the layers.
+    Layers have no embedding: it would add the same to every key, as the bias of `squeeze` does.
     A key knows its row and where in which view it looks, by Fourier features of its cell's centre
     (Tancik et al. 2020) and embeddings of view and pooling, so that parameters do not grow with the
     number of slots. Keys without a valid slot are masked. The state moves the queries through a

@@ -2,7 +2,7 @@
 
 from collections.abc import Generator, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, replace
+from dataclasses import replace
 from functools import partial
 from itertools import chain
 from typing import Any, NoReturn
@@ -177,10 +177,18 @@ def _fit_state(store: FeatureStore, ticks: Ticks, windows: Windows) -> ChannelSt
 
 
 def _some_batches(store: FeatureStore, ticks: Ticks, windows: Windows) -> Iterator[Batch]:
-    """What at most `_STATE_TICKS` of these ticks see, evenly spread, a few at a time."""
-    some = evenly(ticks, _STATE_TICKS)
+    """What at most `_STATE_TICKS` of these ticks see, evenly spread, a few at a time.
+
+    The features are not filled in: those of so many rows may be larger than memory.
+    """
+    some, gatherer = evenly(ticks, _STATE_TICKS), store.gatherer
+    oldest_s = {"sensor": windows.sensor_window_s, "state": windows.state_window_s}
     for part in np.array_split(some, -(-len(some) // _AT_ONCE)):
-        yield store.gather(part, **asdict(windows))
+        sizes = (len(part), windows.horizon, windows.sensor_window, windows.state_window)
+        batch = gatherer.empty_batch(*sizes)
+        selection = gatherer.select(batch, part, 0, 0.0, 0.0, None, oldest_s)
+        gatherer.copy(replace(selection, rows={"action": selection.rows["action"]}), batch)
+        yield batch
 
 
 def _channels(store: FeatureStore, stream: str) -> dict[str, list[str]]:

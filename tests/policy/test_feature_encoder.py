@@ -167,6 +167,15 @@ def test_the_pooler_mixes_layers_by_learned_shares():
     assert torch.allclose(encoder(features, valid, age), encoder(changed, valid, age))
 
 
+def test_the_bias_of_the_keys_can_be_any_embedding_of_the_layers():
+    encoder, (features, valid), age = pooler(), seen(), torch.zeros(2)
+    encoder.mixture.data = torch.randn(2)
+    layers = torch.randn(2, 16)
+    embedded = encoder(features + layers.repeat_interleave(20, dim=0), valid, age)
+    encoder.squeeze.bias.data += encoder.squeeze.weight @ (encoder.mixture.softmax(0) @ layers)
+    torch.testing.assert_close(encoder(features, valid, age), embedded)
+
+
 def test_the_state_directs_the_queries_and_never_becomes_a_value():
     encoder, (features, valid), age = pooler(), seen(), torch.zeros(2)
     states = torch.randn(2, 2, 1, 5) * 10

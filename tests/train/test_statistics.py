@@ -11,6 +11,7 @@ from pipeline.base.errors import NumericsError
 from pipeline.policy.attention import right_aligned
 from pipeline.store import FeatureStore
 from pipeline.store.chunks import write_seal
+from pipeline.store.gather import Batch, Gatherer, Selection
 from pipeline.train.batches import Windows
 from pipeline.train.statistics import anchored_channels, fit_normalization
 
@@ -41,6 +42,19 @@ def test_statistics_are_those_of_the_training_ticks(store, monkeypatch, chunk_by
         assert statistics.count == len(values), name
         assert statistics.mean == pytest.approx(values.mean(0, np.float64), abs=1e-6), name
         assert statistics.std == pytest.approx(values.std(0, np.float64), abs=1e-6), name
+
+
+def test_batches_of_states_read_no_features(store, monkeypatch):
+    """A thousand rows of tokens are gigabytes."""
+    copy, copied = Gatherer.copy, set[str]()
+
+    def seen(gatherer: Gatherer, selection: Selection, batch: Batch) -> None:
+        copied.update(selection.rows)
+        copy(gatherer, selection, batch)
+
+    monkeypatch.setattr(Gatherer, "copy", seen)
+    assert fit_normalization(store, np.arange(30, 60), WINDOWS).state is not None
+    assert copied == {"action"}
 
 
 @pytest.mark.parametrize("chunk_bytes", [1, 2**26])

@@ -16,6 +16,7 @@ from pipeline.base.errors import CheckpointMismatch, ConfigError
 from pipeline.base.provenance import read_tuned_on, tuned_on_of_store
 from pipeline.extract import extract
 from pipeline.policy.checkpoint import find_policy, load_policy
+from pipeline.policy.encoders import FeaturePooler
 from pipeline.policy.live_policy import LivePolicy
 from pipeline.store import FeatureStore
 from pipeline.train.batches import BatchIndices, Windows
@@ -47,6 +48,20 @@ def learned(output: Path, which: str = "last") -> dict[str, torch.Tensor]:
 
 def weights(module: nn.Module) -> dict[str, torch.Tensor]:
     return {n: p.detach().clone() for n, p in module.named_parameters() if p.requires_grad}
+
+
+def moves(parameter: nn.Parameter) -> bool:
+    return parameter.grad is not None and bool(parameter.grad.abs().max() > 0)
+
+
+def assert_judged_as_in_training(output: Path, store: FeatureStore) -> None:
+    """The best policy takes the store, and its error on val is the one that chose it."""
+    best = load_policy(find_policy(output))
+    check_store(best, store)
+    ticks, _ = find_ticks(store, best, "val")
+    predictions = predict(best.policy(), store, ticks, Windows.of(best.params), 64)
+    comparison = compare(predictions, {}, action_space(store, best.normalization))
+    assert comparison.overall("policy") == pytest.approx(best.metrics["val/error"], rel=1e-3)
 
 
 def test_all_that_learns_does_at_its_own_rate_and_the_loss_falls(params, monkeypatch):
@@ -129,14 +144,43 @@ def test_what_is_kept_is_the_averaged_model_that_was_judged(params, tmp_path):
     assert (cached - base.gather(ticks, 2, 1, 1).features).abs().max() > 50 * noise
 
     # The policy's checkpoint says whose features it takes, and is judged on them as in training.
-    best = load_policy(find_policy(output))
-    check_store(best, store)
     with pytest.raises(CheckpointMismatch, match=r"feature_spec\.adapter"):
-        check_store(best, base)
-    ticks, _ = find_ticks(store, best, "val")
-    predictions = predict(best.policy(), store, ticks, Windows.of(best.params), 64)
-    comparison = compare(predictions, {}, action_space(store, best.normalization))
-    assert comparison.overall("policy") == pytest.approx(best.metrics["val/error"], rel=1e-3)
+        check_store(load_policy(find_policy(output)), base)
+    assert_judged_as_in_training(output, store)
+
+
+def test_an_adapter_learns_through_the_pooler_that_reads_its_tokens(params, tmp_path):
+    """Stage two reads the tuned model's own store by the same queries."""
+    given = params(
+        vlm={"pooling": ["tokens"], "layers": [0, -1]},
+        extract={"store": str(tmp_path / "tokens.zarr")},
+        train_head={
+            "robot_state_enabled": True,
+            "feature_encoder": {"kind": "pooler", "queries": 2, "dim": 8, "heads": 2, "layers": 1},
+        },
+        finetune={"max_steps": 2, "eval_every": 2, "eval_ticks": 100},
+    )
+    extract(given, say=lambda _: None)
+    made = trainer(given)
+    draws = [BatchIndices(np.arange(6))]
+    with made.source.feed(draws, Windows.of(made.params), CPU) as feed:
+        _, batch = next(iter(feed))
+        made.module.loss(batch, batch.action, batch.action_valid)[0].backward()
+    parts = dict(made.module.named_parameters())
+    reader = {n: p for n, p in parts.items() if n.startswith("policy.encoders.features.")}
+    assert isinstance(made.source.policy_of(made.module).encoders["features"], FeaturePooler)
+    still = {n.removeprefix("policy.encoders.features.") for n, p in reader.items() if not moves(p)}
+    assert still == {"missing", "steer.weight", "steer.bias"}  # no row is missing, the gate is 0
+    # The other half of an adapter gets gradients when this half is no longer 0.
+    adapters = [p for n, p in parts.items() if "lora_B" in n]
+    assert adapters and all(map(moves, adapters))
+
+    made.fit()
+    document = given.model_dump(mode="json")
+    document["vlm"]["adapter"] = str(given.finetune.output / "best" / "adapter")
+    document["extract"]["store"] = str(tmp_path / "tuned.zarr")
+    extract(Params.model_validate(document), say=lambda _: None)
+    assert_judged_as_in_training(given.finetune.output, FeatureStore.open(tmp_path / "tuned.zarr"))
 
 
 def test_a_run_goes_on_from_any_checkpoint_to_the_same_bits(params, tmp_path, stop_at):
