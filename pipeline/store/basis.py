@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from pipeline.base.errors import StoreIncomplete
 from pipeline.base.projection import Basis
-from pipeline.store.border import store_border
 from pipeline.store.chunks import read_rows
+from pipeline.store.documents import store_border
 from pipeline.store.paths import KEPT, builds_aside, group_attributes, part_path, previous_path
 from pipeline.store.schema import BASIS, read_spec
 

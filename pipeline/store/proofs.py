@@ -13,7 +13,7 @@ from typing import Annotated, Any
 
 from pydantic import Field
 
-from pipeline.base.border import Document, Text
+from pipeline.base.documents import Document, Text
 from pipeline.base.errors import CheckpointIncomplete
 from pipeline.base.files import OutputKind, read_document, refuse_foreign, write_with_digest
 

@@ -12,7 +12,7 @@ from pipeline.base.errors import VLMError
 from pipeline.base.projection import apply_map
 from pipeline.extract import extract
 from pipeline.extract.basis import fit_basis
-from pipeline.extract.reextract import reextract
+from pipeline.extract.row_check import reextract
 from pipeline.extract.survey import sound_episodes, survey
 from pipeline.store import FeatureStore, part_path
 from pipeline.store.archive import archive, restore

@@ -9,23 +9,7 @@ keys and reads files.
 # ruff: noqa: F401
 # pyright: reportUnusedImport=false
 
-from pipeline.base.config.params import Params, described_keys, load_params, load_section, setting
-from pipeline.base.config.policy_use import (
-    PHANTOM,
-    Chunking,
-    DriveParams,
-    EvaluateParams,
-    ExportParams,
-    Level,
-    LimitsFile,
-    MotionLimit,
-    RolloutAblation,
-    RolloutParams,
-    ServeParams,
-    environments,
-    latencies_ms,
-)
-from pipeline.base.config.stage_one import (
+from pipeline.base.config.extraction import (
     PCA,
     AugmentationParams,
     DataParams,
@@ -41,6 +25,22 @@ from pipeline.base.config.stage_one import (
     StoresParams,
     VLMParams,
     stored_as,
+)
+from pipeline.base.config.params import Params, described_keys, load_params, load_section, setting
+from pipeline.base.config.policies import (
+    PHANTOM,
+    Chunking,
+    DriveParams,
+    EvaluateParams,
+    ExportParams,
+    Level,
+    LimitsFile,
+    MotionLimit,
+    RolloutAblation,
+    RolloutParams,
+    ServeParams,
+    environments,
+    latencies_ms,
 )
 from pipeline.base.config.training import (
     DiffusionParams,

@@ -10,7 +10,7 @@ from pipeline.base.config import VLMParams
 from pipeline.base.differences import describe, differences
 from pipeline.base.digests import ContentDigests, ledger_path
 from pipeline.base.errors import StoreMismatch
-from pipeline.base.machine import resolve_device
+from pipeline.base.hardware import resolve_device
 from pipeline.store import FeatureStore
 from pipeline.vlm.feature_spec import feature_spec
 from pipeline.vlm.loading import load_model
