@@ -25,6 +25,7 @@ from pipeline.store.proofs import PROOF, find_proof
 from pipeline.store.schema import BASIS, MOST_ROW_BYTES, ArraySpec
 from pipeline.vlm.checkpoint_folder import tuned_on
 from pipeline.vlm.feature_spec import FeatureSpec
+from pipeline.vlm.slots import layer_name
 
 
 def check_space(
@@ -171,5 +172,6 @@ def _attributes(checked: Sequence[CheckedEpisode], survey: Survey) -> dict[str, 
 
 def _proof(survey: Survey) -> dict[str, Any]:
     """The attribute with what a probe found that this type of storage loses, if one did."""
-    proof = find_proof(survey.target.parent, survey.spec.document)
+    groups = {f"{layer_name(slot.layer, slot.norm)}, {slot.pooling}" for slot in survey.spec.slots}
+    proof = find_proof(survey.target.parent, survey.spec.document, groups)
     return {} if proof is None else {PROOF: proof.model_dump(mode="json")}

@@ -6,7 +6,7 @@ features into that type, in the same folder, copies the verdict into its store.
 
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, Any
@@ -60,8 +60,8 @@ class Proofs(Document):
 
 
 def features_digest(spec: Mapping[str, Any]) -> str:
-    """The digest of a feature spec without how the features are stored."""
-    but = {"digest", "storage_dtype", "pca"}
+    """The digest of a feature spec without how the features are stored, and without the slots."""
+    but = {"digest", "storage_dtype", "pca", "slots"}
     kept = {name: value for name, value in spec.items() if name not in but}
     if "pca" in spec:
         kept["dim"] = spec["pca"]["of"]
@@ -89,13 +89,16 @@ def write_proofs(store: Path, spec: Mapping[str, Any], types: Mapping[str, Proof
     return path
 
 
-def find_proof(folder: Path, spec: Mapping[str, Any]) -> Proof | None:
-    """The verdict in a folder of stores on how the features of this spec are stored."""
+def find_proof(folder: Path, spec: Mapping[str, Any], groups: Collection[str]) -> Proof | None:
+    """The verdict in a folder of stores on how these groups of features of a spec are stored."""
     features, name = features_digest(spec), stored_name(spec)
     for path in sorted(folder.glob(f"*.zarr{SUFFIX}")):
         proofs = _read(path)
         if proofs is not None and proofs.features == features and name in proofs.types:
-            return proofs.types[name]
+            proof = proofs.types[name]
+            losses = [loss for loss in proof.losses if loss.of in groups]
+            if len(losses) == len(groups):
+                return proof.model_copy(update={"losses": losses})
     return None
 
 

@@ -37,8 +37,9 @@ def projected(changed, extracted, tmp_path):
 
 def test_rows_are_the_projected_features(projected):
     params, whole = projected
-    loss = Loss(of="layer 3, mean", r2=-0.01, error_std=0.02)
-    proof = Proof(recordings=3, ticks=60, losses=[loss])
+    groups = [f"layer 3, {pooling}" for pooling in ("mean", "image_mean", "view_mean")]
+    losses = [Loss(of=group, r2=-0.01, error_std=0.02) for group in groups]
+    proof = Proof(recordings=3, ticks=60, losses=losses)
     write_proofs(whole.path, whole.spec, {"pca 24 in int8": proof})
     report, lines = run(params)
     store = FeatureStore.open(params.extract.store)
@@ -129,6 +130,15 @@ def test_stores_of_one_basis_are_merged(projected, changed, tmp_path):
     merged = FeatureStore.open(tmp_path / "stores" / "merged.zarr")
     assert merged.basis.digest == FeatureStore.open(copy).basis.digest
     assert verify(merged.path).sound
+
+
+def test_a_plan_fits_nothing(projected):
+    params, _ = projected
+    only = params.extract.model_copy(update={"plan": True})
+    report, lines = run(params.model_copy(update={"extract": only}))
+    assert report is None
+    assert any(line.startswith("rows: ") for line in lines)
+    assert not params.extract.store.exists()
 
 
 def test_augmented_variants_share_the_basis(changed, tmp_path):
