@@ -10,7 +10,6 @@ import zarr
 from pipeline.base.errors import ConfigError
 from pipeline.base.files import MARKER, REPORT, refuse_foreign
 from pipeline.store.archive import archive
-from pipeline.store.paths import STORE
 from tests.store.samples import content
 
 PRESS = 'data.sources=[{"name": "made", "path": "Press"}]'
@@ -22,7 +21,7 @@ WRITERS: dict[str, tuple[str, str, tuple[str, ...]]] = {
     "lost": ("stages.extract", "stores/made.zarr.previous", (PRESS,)),
     "recordings": ("stages.demo", "demo", ("demo.recordings={}",)),
     "checkpoint": ("stages.demo", "vlm", ("demo.checkpoint={}",)),
-    "new": ("stages.demo", "vlm.new", ("demo.checkpoint={tmp}/vlm",)),
+    "new": ("stages.demo", "demo.new", ("demo.recordings={tmp}/demo",)),
     "merge": ("stages.store", "x.zarr", ("stores.output={}",)),
     "merge build": ("stages.store", "x.zarr.part", ("stores.output={tmp}/x.zarr",)),
     "archive": ("stages.archive", "x.zarr", ("archive.output={}",)),
@@ -97,13 +96,6 @@ def test_is_left_as_it_is(writer, foreign, params, here, tmp_path):
     assert str(place) in complained
     assert "Traceback" not in complained
     assert (place.read_bytes() if foreign == "file" else content(place)) == before
-
-
-def test_a_marker_that_a_kill_cut_off_makes_no_folder_foreign(tmp_path: Path) -> None:
-    (tmp_path / MARKER).touch()
-    assert STORE.owns(tmp_path)
-    (tmp_path / "thesis.txt").write_text("years of work")
-    assert not STORE.owns(tmp_path)
 
 
 def test_a_folder_of_reports_is_known_by_its_marker_alone(tmp_path: Path) -> None:
