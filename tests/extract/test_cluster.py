@@ -1,11 +1,8 @@
 """Stage one on dask workers: the same store, whatever dies on the way."""
 
 import asyncio
-import json
-import math
 import os
 import pickle
-import re
 import signal
 import time
 from collections import Counter
@@ -25,7 +22,7 @@ from distributed import LocalCluster, Security, rpc
 
 from pipeline.base import errors
 from pipeline.base.config import Params
-from pipeline.base.digests import ContentDigests, file_digest, ledger_path
+from pipeline.base.digests import file_digest
 from pipeline.base.errors import (
     ConfigError,
     PipelineError,
@@ -33,17 +30,15 @@ from pipeline.base.errors import (
     VLMError,
 )
 from pipeline.extract.cluster import ExtractionPlugin, connected
-from pipeline.extract.survey import Survey, survey
-from pipeline.store import FeatureStore, RowSource, StoreBuild, part_path
+from pipeline.extract.survey import Survey
+from pipeline.store import FeatureStore, RowSource, part_path
 from pipeline.vlm.feature_spec import feature_spec
 from tests.extract.conftest import Process, assert_same, missing_of, run
 
-BATCH = 4
 PATIENCE_S = 200
 """For what takes seconds, on a machine that does much else."""
 PRELOADED = """
-import os, signal, threading, time
-from collections import defaultdict
+import os, signal, threading
 from contextlib import suppress
 from pathlib import Path
 from pipeline.base.errors import NumericsError
@@ -81,29 +76,8 @@ def encoded(self, rows, encode=encode):
         yield batch, features
 
 def note(rows):
-    # Other threads compute on meanwhile, but what they have noted is on its way to be marked.
-    with one_at_a_time:
-        before = rows_by_process()[os.getpid()]
-        with (control / "computed").open("a") as log:
-            log.write(" ".join(map(str, (os.getpid(), *rows))) + "\\n")
-        if (control / "kill").exists() and before:
-            wait_until(lambda: before <= set(map(int, (control / "marked").read_text().split())))
-            with suppress(FileNotFoundError):  # another was first
-                (control / "kill").unlink()
-                os.kill(os.getpid(), signal.SIGKILL)
-
-def rows_by_process():
-    found = defaultdict(set)
-    with suppress(FileNotFoundError):  # the first
-        for line in (control / "computed").read_text().splitlines():
-            process, *rows = map(int, line.split())
-            found[process] |= set(rows)
-    return found
-
-def wait_until(true):
-    deadline = time.monotonic() + 100
-    while not true() and time.monotonic() < deadline:
-        time.sleep(0.02)
+    with one_at_a_time, (control / "computed").open("a") as log:
+        log.write(" ".join(map(str, (os.getpid(), *rows))) + "\\n")
 
 if prepare.__module__ == RowPreparation.__module__:  # a worker may run this twice
     RowPreparation.prepare, Encoder.encoded, ExtractionPlugin.setup = prepared, encoded, setup
@@ -117,7 +91,6 @@ class Workers:
 
     cluster: LocalCluster
     control: Path
-    preload: Path
 
     @property
     def address(self) -> str:
@@ -172,7 +145,7 @@ def two_workers(forked: None, tmp_path_factory: pytest.TempPathFactory) -> Itera
             preload=str(preload),
         ) as cluster,
     ):
-        yield Workers(cluster, control, preload)
+        yield Workers(cluster, control)
 
 
 @pytest.fixture
@@ -231,27 +204,6 @@ class TestStore:
 
 
 class TestDeaths:
-    @pytest.mark.slow
-    def test_a_killed_worker_loses_one_batch(self, changed, workers, tmp_path, monkeypatch):
-        def noted(self, rows, *args, mark=StoreBuild.mark):
-            mark(self, rows, *args)
-            with (workers.control / "marked").open("a") as log:
-                log.write(" ".join(map(str, (*rows, ""))))
-
-        pages = {"layers": [-1, 1]}  # a row fills a page, so that no task has two batches
-        expected = changed(vlm=pages, extract={"store": str(tmp_path / "expected.zarr")})
-        run(expected)
-        monkeypatch.setattr(StoreBuild, "mark", noted)
-        workers.ask("marked")
-        workers.ask("kill")  # one that computes when all that it did before is marked
-        params = changed(vlm=pages, extract={"workers": workers.address})
-        run(params)
-        assert_same(
-            FeatureStore.open(params.extract.store), FeatureStore.open(expected.extract.store)
-        )
-        times, _ = workers.computed()
-        assert 1 <= times.total() - len(times) <= BATCH
-
     def test_poisoned_recordings_are_reported_when_all_others_are_done(
         self, changed, recordings, write_episode, workers, tmp_path
     ):
@@ -356,40 +308,6 @@ class TestRefusals:
             assert str(back) == "what, where, what to run"
 
 
-class TestScheduler:
-    def test_a_killed_scheduler_is_said_and_the_next_run_completes(
-        self, changed, here, tmp_path, monkeypatch, begun
-    ):
-        address_file = tmp_path / "scheduler.json"
-        options = ["--scheduler-file", str(address_file)]
-        scheduler = begun("scheduler", "--port", "0", "--no-dashboard", *options)
-        worker = begun("worker", *WORKER, *options)
-        mark = StoreBuild.mark
-        marked: list[int] = []
-
-        def then_killed(self, rows, *args):
-            mark(self, rows, *args)
-            marked.extend(rows)
-            scheduler.kill()
-
-        try:
-            while not address_file.exists():
-                time.sleep(0.05)
-            monkeypatch.setattr(StoreBuild, "mark", then_killed)
-            address = json.loads(address_file.read_text())["address"]
-            params = changed(extract={"workers": address, "batch_size": 1})
-            with pytest.raises(PipelineError, match="workers or their scheduler were lost"):
-                run(params)
-        finally:
-            for process in (scheduler, worker):
-                process.kill()
-        monkeypatch.setattr(StoreBuild, "mark", mark)
-        everything = set(range(len(here.array("vl/time"))))
-        assert missing_of(params.extract.store) == everything - set(marked)
-        run(changed())
-        assert_same(FeatureStore.open(params.extract.store), here)
-
-
 @pytest.mark.usefixtures("forked")
 class TestLocalProcesses:
     def test_nobody_else_reaches_them(self, params):
@@ -407,103 +325,47 @@ class TestLocalProcesses:
                 with pytest.raises(HTTPError, match="404"):
                     urlopen(f"http://127.0.0.1:{port}/json/identity.json")
 
-    @pytest.mark.slow
-    def test_ctrl_c_leaves_no_process_and_the_next_run_with_two_completes(
-        self, changed, params_file, begin, here, tmp_path
-    ):
-        process = begin(STAGE, tmp_path, "--params", str(params_file), *TWO)
-        wait_for(lambda: process.stderr.read_text() == "marked\n", process)
-        os.killpg(process.pid, signal.SIGINT)
-        assert process.wait() == 1
-        assert process.stderr.read_text() == "marked\nstopped; run the same command again\n"
-        assert not left_of_group(process.pid)
-        with_workers = changed(extract={"workers": 2, "batch_size": 1})
-        store = with_workers.extract.store
-        missing = missing_of(store)
-        assert missing
-        report = run(with_workers)[0]
-        assert report.computed == len(missing)
-        assert_same(FeatureStore.open(store), here)
-        surveyed = survey(with_workers, ContentDigests(ledger_path(store)))
-        rate = ContentDigests(ledger_path(store)).rate(surveyed.rate_name)
-        assert 0 < rate < math.inf
-
 
 class TestStart:
     """Of local processes, which takes long enough to be cut short."""
-
-    @pytest.mark.slow
-    def test_a_worker_killed_as_it_starts_is_said(self, params_file, begin, tmp_path):
-        process = self.begun(begin, params_file, tmp_path)
-        (tmp_path / "kill").touch()
-        assert process.wait() == 2
-        said = process.stderr.read_text()
-        assert re.match(r"error: extract.workers: 2 worker processes could not be started", said)
-        assert len(said.splitlines()) == 1
-        assert not left_of_group(process.pid)
 
     def test_a_worker_killed_as_it_is_told_what_to_do_is_said(self, changed, workers):
         workers.ask("kill-at-setup")
         with pytest.raises(ConfigError, match=r"extract\.workers: a worker cannot begin"):
             run(changed(extract={"workers": workers.address}))
 
-    @pytest.mark.parametrize(
-        "how", [pytest.param(signal.SIGINT, marks=pytest.mark.slow), signal.SIGTERM]
-    )
-    def test_stopped_as_workers_start(self, params_file, begin, tmp_path, how):
-        process = self.begun(begin, params_file, tmp_path)
-        if how == signal.SIGINT:
-            os.killpg(process.pid, how)  # as a terminal does
-        else:
-            os.kill(process.pid, how)
+    def test_stopped_as_workers_start(self, params_file, begin, tmp_path):
+        """A worker has begun, and will not be up before the test ends."""
+        preload = tmp_path / "starting.py"
+        preload.write_text(STARTING.format(control=str(tmp_path)))
+        code = f"import dask\ndask.config.set({{'distributed.worker.preload': {str(preload)!r}}})\n"
+        told = ("--params", str(params_file), "--set", "extract.workers=2")
+        process = begin(code + STAGE, tmp_path, *told)
+        while not (tmp_path / "starting").exists():
+            assert process.poll() is None, process.stderr.read_text()
+            time.sleep(0.02)
+        os.kill(process.pid, signal.SIGTERM)
         assert process.wait() == 1
         assert process.stderr.read_text() == "stopped; run the same command again\n"
         assert not left_of_group(process.pid)
 
-    def begun(self, begin, params_file: Path, folder: Path):
-        """The command; a worker of it has begun, and will not be up before the test ends."""
-        preload = folder / "starting.py"
-        preload.write_text(STARTING.format(control=str(folder)))
-        code = f"import dask\ndask.config.set({{'distributed.worker.preload': {str(preload)!r}}})\n"
-        process = begin(code + STAGE, folder, "--params", str(params_file), *TWO)
-        wait_for((folder / "starting").exists, process)
-        return process
-
 
 STAGE = """
-import sys, time
-from pipeline.store import StoreBuild
+import sys
 from stages.command import run
 from stages.extract import main
 
-def mark(self, *args, mark=StoreBuild.mark):
-    mark(self, *args)
-    print("marked", file=sys.stderr, flush=True)
-    time.sleep(600)
-
-StoreBuild.mark = mark
 raise SystemExit(run("", main, sys.argv[1:]))
 """
-"""The stage, which says when rows are marked and then waits to be stopped."""
 
 STARTING = """
-import os, signal, time
-from contextlib import suppress
+import time
 from pathlib import Path
 
-control = Path({control!r})
-(control / "starting").touch()
-while not (control / "killed").exists():
-    with suppress(FileNotFoundError):
-        (control / "kill").rename(control / "killed")
-        os.kill(os.getpid(), signal.SIGKILL)
-    time.sleep(0.02)
+(Path({control!r}) / "starting").touch()
+time.sleep(600)
 """
-"""Run by each worker as it starts: it goes no further, until one was asked to kill itself."""
-
-TWO = ("--set", "extract.workers=2")
-
-WORKER = ("--nthreads", "2", "--no-nanny", "--death-timeout", "60", "--no-dashboard")
+"""Run by each worker as it starts: it goes no further."""
 
 
 @pytest.fixture
@@ -514,13 +376,6 @@ def begun(begin: Callable[..., Process], tmp_path: Path) -> Callable[..., Proces
         return begin(f"from distributed.cli.dask_{role} import main\nmain()", tmp_path, *options)
 
     return begin_role
-
-
-def wait_for(true: Callable[[], bool], process) -> None:
-    """Return when something is so; fail where the process ends before."""
-    while not true():
-        assert process.poll() is None, process.stderr.read_text()
-        time.sleep(0.02)
 
 
 def left_of_group(group: int) -> list[str]:

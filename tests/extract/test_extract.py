@@ -370,17 +370,6 @@ class TestWhatWouldBeLost:
         assert contents(params.extract.store) == before
 
     @pytest.mark.usefixtures("extracted")
-    def test_another_embodiment_of_the_same_source_is_refused(
-        self, changed, tmp_path, narrower, write_episode, no_model_later
-    ):
-        write_episode(tmp_path / "other" / "Task" / "episode_9", 9)
-        narrower(tmp_path / "other")
-        no_model_later(images=False)
-        other = {"sources": [{"name": "made", "path": str(tmp_path / "other")}]}
-        with pytest.raises(StoreMismatch, match=r"sensor.names: .* -> "):
-            run(changed(data=other))
-
-    @pytest.mark.usefixtures("extracted")
     def test_a_source_that_is_missing_for_a_moment_costs_no_row(
         self, params, changed, unmount, counted
     ):
@@ -403,35 +392,6 @@ class TestWhatWouldBeLost:
         assert contents(store) == whole
 
     @pytest.mark.usefixtures("extracted")
-    def test_an_instruction_changed_and_changed_back_computes_nothing(
-        self, params, changed, recordings, counted, write_episode
-    ):
-        store, previous = params.extract.store, params.extract.store.with_name("made.zarr.previous")
-        whole, source = contents(store), params.data.sources[0].model_dump()
-        other = {"sources": [source | {"instruction": "hold still"}]}
-        _, said = run(changed(data=other, extract={"plan": True}))
-        (line,) = (line for line in said if str(previous) in line)
-        assert "is kept as" in line
-        assert sum(counted) == 0
-        report, said = run(changed(data=other))
-        assert sum(counted) == report.computed > 0
-        (line,) = (line for line in said if line.startswith(f"{previous}: "))
-        assert "MiB" in line
-        assert "store gc" in line
-        second = contents(store)
-        assert run(changed(data=other))[0] is None
-        assert contents(previous).items() >= whole.items(), "a run that changes nothing keeps it"
-        for data, then in (({}, whole), (other, second)):
-            counted.clear()
-            report, _ = run(changed(data=data))
-            assert not counted
-            assert report.taken == report.rows
-            assert contents(store) == then
-        write_episode(recordings / "Press" / "episode_9", 9)
-        run(changed(data=other))
-        assert not previous.exists(), "the store of before had no row that this one lacks"
-
-    @pytest.mark.usefixtures("extracted")
     def test_an_interrupted_return_still_takes_the_rows_of_the_kept_store(
         self, params, unmount, monkeypatch, counted
     ):
@@ -447,18 +407,6 @@ class TestWhatWouldBeLost:
         _, said = run(params)
         assert any("continuing the interrupted build" in line for line in said)
         assert not counted, "its rows were there"
-
-    @pytest.mark.usefixtures("extracted")
-    def test_says_what_only_the_store_kept_before_holds(self, params, recordings, unmount):
-        unmount()
-        run(params)
-        (lost, *_) = sorted(path for path in recordings.rglob("episode_*") if path.is_dir())
-        shutil.rmtree(lost)
-        _, said = run(params)
-        previous = params.extract.store.with_name("made.zarr.previous")
-        assert any(f"is kept as {previous}" in line for line in said)
-        (line,) = (line for line in said if line.startswith(f"{previous} is removed or replaced"))
-        assert "2 episode(s) that are not in this run" in line
 
     @pytest.mark.usefixtures("extracted")
     def test_a_copy_that_the_user_made_is_not_the_one_that_was_kept(self, params, recordings):
@@ -549,20 +497,6 @@ class TestPlan:
         notes = [line for line in lines if "ticks at" in line]
         assert notes == ([] if said is None else [f"source 'made': {said}"])
 
-    @pytest.mark.usefixtures("extracted")
-    def test_names_a_time_once_a_speed_is_known(self, changed):
-        for sections in {"data": {"vlm_reuse_count": 2}}, {"vlm": {"prompt": "{images}"}}:
-            _, said = run(changed(extract={"plan": True}, **sections))
-            assert any("rows/s, as last measured" in line for line in said)
-
-    def test_warns_where_one_recording_without_poses_decides_for_all(self, changed, monkeypatch):
-        has_poses = property(lambda recording: "Press" not in str(recording.path))
-        monkeypatch.setattr(WindowedRecording, "has_poses", has_poses)
-        for rotation, count in (("auto", 1), ("euler_delta", 0)):
-            _, said = run(changed(extract={"plan": True}, data={"action_rotation": rotation}))
-            warnings = [line for line in said if line.startswith("WARNING: 1 of 3 episode(s)")]
-            assert len(warnings) == count
-
 
 class TestRefusals:
     def test_too_little_disk_is_refused_before_the_model(self, params, monkeypatch, no_model_later):
@@ -597,14 +531,6 @@ class TestRefusals:
         metadata["camera_views"] = []
         (episode / "metadata.json").write_text(json.dumps(metadata))
         with pytest.raises(RecordingError, match=r"1 of 3 .*\n.*episode_3: views\.0: .*found '"):
-            run(params)
-
-    def test_an_episode_whose_text_no_reader_of_a_store_would_take(
-        self, params, monkeypatch, no_model_later
-    ):
-        no_model_later(images=False)
-        monkeypatch.setattr(WindowedRecording, "group", "g" * 10_001)
-        with pytest.raises(RecordingError, match=r"3 of 3 .*\n.*: group: expected a text to have"):
             run(params)
 
     def test_a_row_that_no_reader_would_take(self, params, monkeypatch, no_model_later):

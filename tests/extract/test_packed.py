@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from safetensors.torch import load_file, save_file
 
 from pipeline.base.arrays import widen
 from pipeline.base.config import Params
@@ -98,54 +97,3 @@ def test_a_part_of_a_packed_store_is_taken_over(stores, tmp_path):
         if bytes(key) in known
     ]
     assert same and all(same)
-
-
-NORMED = {"layers": (-1,), "norms": (True,)}
-
-
-def test_a_model_with_huge_channels_keeps_the_others(stores, tmp_path):
-    """As released models have: a few channels hundreds of times larger than all others."""
-    params, plain = stores["float32"]
-    folder = Path(shutil.copytree(params.vlm.checkpoint, tmp_path / "huge"))
-    huge = [5, 70]
-    for file in folder.glob("*.safetensors"):
-        tensors = load_file(file)
-        for name in tensors:
-            if name.endswith("language_model.norm.weight") or name == "model.norm.weight":
-                tensors[name][huge] *= 500
-        save_file(tensors, file, {"format": "pt"})
-    found = {}
-    for dtype in ("float32", "float8", "int8"):
-        extract = {"store": tmp_path / f"{dtype}.zarr", "dtype": dtype}
-        vlm = {"checkpoint": str(folder)} | NORMED
-        changed = params.model_copy(
-            update={
-                "vlm": params.vlm.model_copy(update=vlm),
-                "extract": params.extract.model_copy(update=extract),
-            }
-        )
-        run(changed)
-        assert verify(tmp_path / f"{dtype}.zarr").sound
-        store = FeatureStore.open(tmp_path / f"{dtype}.zarr")
-        found[dtype] = widen(store.array("vl/features")).astype(np.float64)
-    exact = found["float32"]
-    sizes = np.sqrt(np.square(exact).mean(axis=(0, 1)))
-    others = np.setdiff1d(np.arange(len(sizes)), huge)
-    assert sizes[huge].min() > 100 * np.median(sizes[others])
-    spread = exact.std(axis=(0, 1))
-    lost = {
-        dtype: np.sqrt(np.square(found[dtype] - exact).mean(axis=(0, 1))) / spread
-        for dtype in ("float8", "int8")
-    }
-    assert lost["float8"].max() < 0.1
-    beside = np.isin(others // 32, [channel // 32 for channel in huge])
-    assert lost["int8"][others[~beside]].max() < 0.02
-    assert lost["int8"][others[beside]].min() > 0.1  # what shares their scales is coarse
-    assert plain.feature_shape[1] == len(sizes)
-    some = params.verify.model_copy(update={"reextract": 4})
-    for dtype in ("int8", "float8"):  # recomputed rows differ by no more than a code
-        place = tmp_path / f"{dtype}.zarr"
-        extract = params.extract.model_copy(update={"store": place, "dtype": dtype})
-        vlm = params.vlm.model_copy(update={"checkpoint": str(folder)} | NORMED)
-        asked = params.model_copy(update={"vlm": vlm, "extract": extract, "verify": some})
-        assert not reextract(place, asked, lambda line: None).beyond
