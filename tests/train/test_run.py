@@ -10,7 +10,7 @@ import pytest
 from pipeline.base.errors import CheckpointIncomplete, CheckpointMismatch, ConfigError
 from pipeline.base.files import read_document
 from pipeline.store import FeatureStore
-from pipeline.train.run import RUN_FOLDER, TRAINER_VERSION, finished_run, open_run
+from pipeline.train.run import TRAINER_VERSION, finished_run, open_run
 
 
 @pytest.fixture(scope="session")
@@ -104,15 +104,6 @@ def test_other_params_move_an_unfinished_run_aside(store, params, unfinished):
     assert decides["train_head"]["lr"] == 0.003
 
 
-def test_a_run_put_aside_gives_way_to_the_next(store, params, trainer, unfinished):
-    aside = unfinished.with_name("head.part-old")
-    shutil.copytree(unfinished, aside)
-    (aside / "run.json").write_text("older")
-    trainer(store, params(lr=0.5, max_steps=1)).fit()
-    decides = read_document(aside / "run.json", dict)[1]["decides"]
-    assert decides["train_head"]["lr"] == 0.003
-
-
 def test_nothing_is_written_before_the_params_are_known_to_be_good(
     store, params, trainer, unfinished
 ):
@@ -178,22 +169,6 @@ def test_what_no_training_wrote_is_never_replaced(store, params):
     assert (output / "thesis.tex").exists()
 
 
-@pytest.mark.parametrize(("document", "beside"), [('{"sweep": 3}', "models"), ("{", "best")])
-def test_a_run_json_of_another_program_makes_no_training_run(store, params, document, beside):
-    output = params().output
-    output.mkdir()
-    (output / "run.json").write_text(document)
-    (output / "thesis.tex").write_text("years of work")
-    if beside:
-        (output / beside).mkdir()
-        (output / beside / "policy.json").write_text("{}")
-    if beside == "best":  # a run of ours whose run.json was damaged
-        assert RUN_FOLDER.owns(output)
-    else:
-        with pytest.raises(ConfigError, match="a training run that this project wrote"):
-            open_run(params(), store)
-
-
 def test_checkpoints_without_their_run_are_not_guessed_at(store, params, unfinished):
     (unfinished / "run.json").unlink()
     with pytest.raises(ConfigError, match="a training run that this project wrote"):
@@ -221,13 +196,6 @@ def test_the_advice_of_a_damaged_unfinished_run_leads_out(store, params, trainer
     assert "or remove its folder and run the training" in str(caught.value)
     shutil.rmtree((unfinished / file).parent)
     assert trainer(store, params()).run.status == "new"
-
-
-def test_a_run_without_a_checkpoint_refuses_no_other_store(store, params, tiny_store, tmp_path):
-    open_run(params(), store).begin()
-    other = FeatureStore.open(tiny_store(tmp_path, name="other", spec_digest="another"))
-    run = open_run(params(), other)
-    assert (run.status, run.notes) == ("new", ())
 
 
 def test_code_of_other_numbers_goes_on_with_no_run(store, params, unfinished, monkeypatch):
