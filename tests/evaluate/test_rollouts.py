@@ -94,23 +94,6 @@ def test_an_episode_is_the_same_alone_as_among_others() -> None:
     np.testing.assert_allclose(there.trace.offset_mm, here.trace.offset_mm, atol=1e-3)
 
 
-def test_real_time_chunking_gives_the_policy_what_is_left_of_its_plan(monkeypatch):
-    parts = made("flow_matching")
-    act, guides, chunks = parts[1].act, [], []
-
-    def watched(observation: Any, generators: Any, guide: Any) -> torch.Tensor:
-        guides.append(guide)
-        chunks.append(act(observation, generators, guide))
-        return chunks[-1]
-
-    monkeypatch.setattr(parts[1], "act", watched)
-    rolled(parts, chunking="rtc", execute=2, ablations=(), episodes=1)
-    assert guides[0] is None and len(guides) > 3
-    for guide, before in zip(guides[1:], chunks, strict=False):
-        torch.testing.assert_close(guide.chunk[:, :2], before[:, 2:])
-        assert (guide.weight[:, :2] > 0).all() and not guide.weight[:, 2:].any()
-
-
 def test_robots_share_a_pass_of_the_model_and_are_told_the_task() -> None:
     parts = made()
     fresh = rolled(parts, ablations=())
@@ -183,19 +166,6 @@ def test_a_stream_that_is_off_says_nothing(monkeypatch: pytest.MonkeyPatch) -> N
         assert all(seen[other].any() and not (seen[other] == 0.25).all() for seen in silent)
         assert len({tuple(seen["feature_age"]) for seen in silent}) > 3
         assert all(seen["slot_valid"].all() and seen["feature_age"].max() < 0.4 for seen in silent)
-
-
-def test_streams_that_a_policy_lacks_are_passed_over() -> None:
-    parts = made(features_enabled=False)
-    rollouts = rolled(parts, episodes=1, ablations=("features off", "state off"))
-    assert rollouts.controllers == ("policy", "state off", "expert")
-    # One whose store lacks sensor and state, so that they have no channels.
-    checkpoint, _, glance = made()
-    shape = replace(checkpoint.shape, sensor_channels=0, state_dim=0)
-    normal = replace(checkpoint.normalization, sensor=None, state=None)
-    policy = Policy(checkpoint.params, shape, normal).eval()
-    without = replace(checkpoint, shape=shape, normalization=normal)
-    assert len(rolled((without, policy, glance), episodes=1).of("policy")) == 1
 
 
 def test_an_action_that_is_no_number_stops_its_robot_alone(monkeypatch: pytest.MonkeyPatch) -> None:

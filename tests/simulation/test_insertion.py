@@ -8,19 +8,16 @@ import pytest
 from numpy.typing import NDArray
 
 from pipeline.base.config import Level
-from pipeline.simulation.arm import LAG_S, ArmMotion, orientation
-from pipeline.simulation.expert import NOT_ALIGNED_MM, REACTION_TICKS, expert_motion
+from pipeline.simulation.arm import LAG_S, orientation
+from pipeline.simulation.expert import NOT_ALIGNED_MM, REACTION_TICKS
 from pipeline.simulation.insertion import (
     AT_LAYER_MM,
     FORCE_LIMIT_N,
-    HOLD_TICKS,
     INSERTED,
     MAX_TICKS,
     MISS_MM,
-    OVERSHOOT_MM,
     TICK_S,
     NeedleInsertion,
-    Progress,
 )
 from pipeline.simulation.layout import WORKSPACE_MM, InsertionLayout, draw_layout
 from pipeline.simulation.needle_sensor import BIN_MM
@@ -63,25 +60,6 @@ def test_a_scan_peaks_at_the_tip_to_tissue_distance() -> None:
         assert abs(peak_bin(insertion) * BIN_MM - distance) <= 8 * BIN_MM
         insertion.step(down(0.17))
     assert peak_bin(insertion) < 150
-
-
-def test_the_layer_is_the_second_peak_until_it_is_the_only_one() -> None:
-    insertion = NeedleInsertion()
-    layout = calm()
-    surface, depth = layout.surfaces_mm[0], layout.tissue.layer_depth_mm
-    start = layout.start_pose.copy()
-    start[2] = surface + 1.0
-    insertion.start(replace(layout, start_pose=start))
-    behind = insertion.sensor[-1, 1:].copy()
-    behind[: int(1.0 / BIN_MM) + 60] = 0
-    # The layer stands on a slope of scattered light, which pulls its peak towards the tip.
-    assert abs(behind.argmax() * BIN_MM - (1.0 + depth)) < 0.05
-    while not insertion.inside:
-        insertion.step(down(0.2))
-    insertion.step(STILL)
-    inside = insertion.sensor[-1, 1:].copy()
-    inside[:150] = 0
-    assert abs(inside.argmax() * BIN_MM - insertion.contact.layer_mm[-1]) < 0.05
 
 
 def test_force_rises_on_contact_drops_at_puncture_and_grows_with_depth() -> None:
@@ -188,20 +166,6 @@ def test_the_demonstrator_succeeds(seed: int, level: Level) -> None:
     assert (np.abs(places) <= WORKSPACE_MM).all()
 
 
-def test_at_moved_most_phantoms_are_pushed_sideways_and_up_or_down() -> None:
-    sideways, heights = 0, 0
-    for seed in range(100, 120):
-        insertion = NeedleInsertion()
-        insertion.reset(seed, "moved")
-        for _ in follow(insertion):
-            pass
-        first, last = insertion.knots[0], insertion.knots[-1]
-        sideways += not np.array_equal(first.target_mm, last.target_mm)
-        heights += abs(first.surface_mm - last.surface_mm) > 0.3  # more than it breathes
-        assert insertion.outcome == INSERTED
-    assert sideways >= 17 and heights >= 12
-
-
 def test_the_demonstrator_reacts_to_a_push_only_after_its_reaction_time() -> None:
     layout = replace(draw_layout(2), push_times_s=np.array([0.65]))
     unpushed = replace(layout, push_times_s=np.zeros(0))
@@ -222,35 +186,6 @@ def test_the_demonstrator_reacts_to_a_push_only_after_its_reaction_time() -> Non
     assert differs.index(True) + 1 - moved.index(True) == REACTION_TICKS
 
 
-def test_both_rotation_conventions_lead_to_the_same_episode() -> None:
-    by_vector, by_angles = NeedleInsertion("rotvec"), NeedleInsertion("euler_delta")
-    by_vector.reset(1)
-    by_angles.reset(1)
-    for _ in range(15):
-        by_vector.step(by_vector.expert_action())
-        before, action = by_angles.setpoint, by_angles.expert_action()
-        by_angles.step(action)
-        np.testing.assert_allclose(by_angles.setpoint - before, action[:6], atol=1e-9)
-    # Angles are added to a setpoint that leads the pose that they were computed at.
-    np.testing.assert_allclose(by_vector.knots[-1].pose, by_angles.knots[-1].pose, atol=0.02)
-
-
-def test_poses_between_ticks_are_what_the_arm_passed() -> None:
-    insertion = NeedleInsertion()
-    insertion.reset(5)
-    for _ in follow(insertion):
-        pass
-    knots = insertion.knots
-    ends = insertion.poses(np.arange(len(knots)) * TICK_S)
-    np.testing.assert_allclose(ends, np.stack([knot.pose for knot in knots]), atol=1e-9)
-    fine = insertion.poses(np.arange(0, insertion.time_s, 0.001))
-    speed = np.linalg.norm(np.diff(fine[:, :3], axis=0), axis=1) / 0.001
-    assert speed.max() < 12.1
-    scene = insertion.scene(0.35)
-    pose = insertion.poses(np.array([0.35]))[0]
-    np.testing.assert_allclose(scene.needle_mm, pose[:2] - insertion.layout.bench_mm)
-
-
 def test_an_action_adds_to_the_setpoint_and_the_arm_follows_with_its_lag() -> None:
     insertion = NeedleInsertion()
     insertion.start(calm())
@@ -263,20 +198,6 @@ def test_an_action_adds_to_the_setpoint_and_the_arm_follows_with_its_lag() -> No
     for _ in range(5):
         insertion.step(STILL)
     np.testing.assert_allclose(insertion.knots[-1].pose, insertion.setpoint, atol=1e-6)
-
-
-def test_a_leap_is_carried_out_at_the_arms_speed() -> None:
-    insertion = NeedleInsertion()
-    insertion.start(calm())
-    before = insertion.knots[-1].pose
-    insertion.step(np.array([20.0, 0, 0, 0, 0, 0, 1]))
-    assert 0 < insertion.knots[-1].pose[0] - before[0] <= 1.2
-    motion, jumps = ArmMotion.resting(np.zeros(6)), []
-    for target in (50.0, -50.0, 50.0):
-        after = motion.towards(np.array([target, 0, 0, 0, 0, 0]), TICK_S)
-        jumps.append(np.abs(after.velocity - motion.velocity).max())
-        motion = after
-    assert max(jumps) <= 12.0 + 1e-9
 
 
 def plunge(insertion: NeedleInsertion, *steps: tuple[int, NDArray[np.float64]]) -> str | None:
@@ -318,46 +239,6 @@ def test_every_way_to_fail_ends_the_episode_with_its_reason() -> None:
     assert len(short.knots) == MAX_TICKS + 1
 
 
-def test_a_needle_inside_is_held_sideways() -> None:
-    insertion = over_the_target()
-    while not insertion.inside:
-        insertion.step(down(0.15))
-    insertion.step(down(0.6))
-    calm_n = insertion.knots[-1].force_n
-    insertion.step(np.array([0.4, 0, 0, 0, 0, 0, 1.0]))
-    pulled = insertion.knots[-1].force_n
-    assert pulled > calm_n
-    # The gauge along the needle feels the friction of it.
-    depth = insertion.layout.tissue.layer_depth_mm - insertion.contact.layer_mm[-1:]
-    straight = insertion.layout.tissue.drag_n(depth)[0]
-    assert insertion.contact.force_n[-1] > straight + 0.02
-
-
-def test_a_limit_that_was_passed_is_no_success() -> None:
-    good = Progress(np.zeros(2), 0.9 * OVERSHOOT_MM, 0.9 * FORCE_LIMIT_N, HOLD_TICKS)
-    assert good.outcome(50) == INSERTED
-    assert replace(good, held_ticks=HOLD_TICKS - 1).outcome(50) is None
-    assert replace(good, overshoot_mm=1.1 * OVERSHOOT_MM).outcome(50) == "beyond the layer"
-    beside = replace(good, puncture_mm=np.array([1.1 * MISS_MM, 0.0]))
-    assert beside.outcome(50) == "punctured beside the target"
-    assert replace(good, max_force_n=1.1 * FORCE_LIMIT_N).outcome(50) == "too much force"
-
-
-def test_a_needle_pulled_out_must_puncture_again_and_every_puncture_is_judged() -> None:
-    insertion = over_the_target()
-    while not insertion.inside:
-        insertion.step(down(0.15))
-    while insertion.inside:
-        insertion.step(down(-0.3))
-    assert insertion.contact.force_n[-1] == 0
-    for _ in range(6):
-        insertion.step(np.array([0.3, 0, 0.05, 0, 0, 0, 1.0]))
-    while insertion.contact.distance_mm[-1] > 0:
-        insertion.step(down(0.15))
-    assert not insertion.inside and insertion.contact.force_n[-1] > 0
-    assert plunge(insertion, (40, down(0.15))) == "punctured beside the target"
-
-
 @pytest.mark.parametrize("action", [np.full(7, np.nan), np.zeros(6)])
 def test_an_action_that_is_none_is_refused(action: NDArray[np.float64]) -> None:
     with pytest.raises(ValueError, match="7 finite numbers"):
@@ -372,29 +253,3 @@ def test_levels() -> None:
         assert not len(full.push_times_s) and not len(depth.push_times_s)
         assert len(moved.push_times_s) == 3
         np.testing.assert_array_equal(full.start_pose, moved.start_pose)
-
-
-def test_the_surface_breathes() -> None:
-    insertion = NeedleInsertion()
-    insertion.start(calm())
-    for _ in range(60):
-        insertion.step(STILL)
-    heights = np.array([knot.surface_mm for knot in insertion.knots])
-    assert 0.05 < np.ptp(heights) < 0.25
-
-
-@pytest.mark.parametrize("distance", [0.7, 4.0])
-def test_the_demonstrator_never_returns_upwards_and_waits_where_it_is(distance: float) -> None:
-    """Averages of what it does at two misses stand between them: nobody learns to hover."""
-
-    def falls(miss: float) -> float:
-        seeds = (np.random.default_rng(seed) for seed in range(100))
-        beside, still = np.array([miss, 0.0]), (np.zeros(3), np.zeros(6))
-        seen = (beside, distance, distance + 2.5, False, *still, 8.0, TICK_S)
-        motions = [expert_motion(*seen, rng)[2] for rng in seeds]
-        return -float(np.mean(motions))
-
-    speeds = [falls(miss) for miss in np.linspace(0, 2, 21)]
-    assert min(speeds) > -0.003  # of tremor alone
-    assert (np.diff(speeds) < 1e-9).all()
-    assert max(-np.diff(speeds)) < 0.025  # no step of its gate
