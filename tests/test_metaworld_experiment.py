@@ -1,12 +1,7 @@
 """The recorder of Meta-World's demonstrations."""
 
-import json
-from collections.abc import Callable
-from concurrent.futures import Future
-from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
@@ -16,9 +11,6 @@ from pipeline.base.config import Source
 from pipeline.base.errors import ConfigError
 from pipeline.data import open_recordings
 from pipeline.simulation.meta_world import HZ, VIEW, instruction_of
-
-if TYPE_CHECKING:
-    from experiments.metaworld.protocol import Run
 
 needs_meta_world = pytest.mark.skipif(
     find_spec("metaworld") is None, reason="needs the extra `metaworld`"
@@ -63,62 +55,6 @@ def test_a_set_is_what_the_expert_did_and_is_recorded_once(tmp_path: Path) -> No
     other = asked.model_copy(update={"episodes": 3})
     with pytest.raises(ConfigError, match=r"record.json: .*episodes 2"):
         record(tmp_path, [other], jobs=1)
-
-
-@needs_meta_world
-@pytest.mark.extra
-def test_the_protocol_goes_from_demonstrations_to_a_table(tmp_path, monkeypatch, capsys):
-    """Tiny: three demonstrations of one task, six steps, rollouts of one episode."""
-    from experiments.metaworld import protocol
-    from experiments.metaworld.table import judged, write_tables
-
-    monkeypatch.setattr(protocol, "EPISODES", 3)
-    blind = replace(protocol.VARIANTS["features off"], evaluations=3)
-    monkeypatch.setitem(protocol.VARIANTS, "features off", blind)
-    monkeypatch.setattr("pipeline.simulation.meta_world.MAX_TICKS", 60)
-    small = {"max_steps: 1500": "max_steps: 6", "eval_every: 250": "eval_every: 3"}
-    text = protocol._PARAMS.read_text(encoding="utf-8")
-    for old, new in small.items():
-        assert old in text
-        text = text.replace(old, new)
-    (tmp_path / "params.yaml").write_text(text, encoding="utf-8")
-    monkeypatch.setattr(protocol, "_PARAMS", tmp_path / "params.yaml")
-    tasks = ("button-press-topdown-v3",)
-    run = protocol.Run(tmp_path / "out", ("features off",), tasks, seeds=1, episodes=1)
-    run_here(run, monkeypatch)
-    (policy,) = run.policies()
-    assert policy.done and {2, 4, 6} <= set(policy.rollouts())
-    assert (policy.folder / "rollout" / "6" / "report.html").exists()
-    before = {p: p.stat().st_mtime_ns for p in policy.folder.rglob("*") if p.is_file()}
-    run_here(run, monkeypatch)
-    assert before == {p: p.stat().st_mtime_ns for p in policy.folder.rglob("*") if p.is_file()}
-    with pytest.raises(ConfigError, match="found those of another run"):
-        run_here(replace(run, episodes=2), monkeypatch)
-    (one,) = judged(run)
-    assert one.task == tasks[0] and {len(ended) for ended in one.successes.values()} == {1}
-    capsys.readouterr()
-    assert write_tables(run).exists()
-    table = json.loads((run.out / "tables.json").read_text())["variants"]["features off"]
-    assert list(table) == [*tasks, "mean of 1"] and table["mean of 1"][-2:] == [1, 1]
-    assert "features off" in capsys.readouterr().out
-
-
-def run_here(run: "Run", monkeypatch: pytest.MonkeyPatch) -> None:
-    """`run_protocol` without processes of its own, which would not see what is replaced here."""
-    from experiments.metaworld import protocol
-
-    class Here:
-        def __init__(self, *_: object, **__: object) -> None: ...
-
-        def submit(self, task: Callable[..., object], *told: object) -> Future[object]:
-            done: Future[object] = Future()
-            done.set_result(task(*told))
-            return done
-
-        def shutdown(self, **_: object) -> None: ...
-
-    monkeypatch.setattr(protocol, "ProcessPoolExecutor", Here)
-    protocol.run_protocol(run)
 
 
 def test_every_variant_gives_params_that_can_be_read(tmp_path: Path) -> None:

@@ -33,7 +33,7 @@ def assert_is_a_report(out: str, name: str) -> None:
         assert {"what", "found", "wanted", "reached"} <= set(target)
 
 
-SLOW = {"extract", "head_latency", "reading", "robot_jitter"}
+SLOW = {"extract", "head_latency", "reading", "robot_jitter", "slots"}
 
 
 @pytest.mark.parametrize(

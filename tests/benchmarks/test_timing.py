@@ -3,10 +3,8 @@
 import json
 import sys
 
-import pytest
-
 from benchmarks import timing
-from benchmarks.timing import Race, at_least, at_most, command, race, report
+from benchmarks.timing import Race, race, report
 
 
 def test_rounds_are_interleaved_and_warm_up_does_not_count():
@@ -43,18 +41,6 @@ def test_a_ratio_is_the_median_of_the_ratios_of_each_round():
     }
 
 
-def test_a_target_says_whether_it_was_reached():
-    assert at_least("speed", 1.9, 2) == {
-        "what": "speed",
-        "found": 1.9,
-        "wanted": ">= 2",
-        "reached": False,
-    }
-    assert at_least("speed", 2.0, 2)["reached"]
-    assert at_most("wait", 0.01, 0.02)["reached"]
-    assert not at_most("wait", 0.03, 0.02)["reached"]
-
-
 def test_a_report_is_one_line_of_json_with_machine_and_command(capsys, monkeypatch):
     monkeypatch.setattr(sys, "argv", ["/somewhere/benchmarks/gather.py", "--rounds", "3"])
     report("gather", settings={"rows": 2}, results={}, ratios={}, targets=[], quick=True)
@@ -66,9 +52,3 @@ def test_a_report_is_one_line_of_json_with_machine_and_command(capsys, monkeypat
     assert line["machine"]["cores"] >= 1
     assert line["machine"]["device"] == "cpu"
     assert line["machine"]["torch"]
-
-
-def test_a_contender_that_fails_is_not_hidden():
-    with pytest.raises(ZeroDivisionError):
-        race({"broken": lambda: 1 / 0}, rounds=1)
-    assert command()

@@ -1,7 +1,6 @@
 """The command refuses a checkpoint and a store that do not belong together."""
 
 import json
-import re
 import shutil
 from contextlib import redirect_stdout
 from io import StringIO
@@ -11,9 +10,8 @@ import pytest
 import yaml
 
 from pipeline.look.page import writing
-from pipeline.look.page.blocks import Picture, Report, Text
-from pipeline.store.chunks import write_seal
-from stages import evaluate, train_head
+from pipeline.look.page.blocks import Report, Text
+from stages import evaluate
 from stages.command import run
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -96,23 +94,6 @@ def test_without_a_checkpoint_it_judges_what_train_head_wrote(
     assert f"{trained_tiny.parent / 'head'} (step 3)" in capsys.readouterr().out
 
 
-@pytest.mark.usefixtures("reports")
-def test_a_policy_outlives_the_renaming_of_its_source(trained_tiny, judged, tmp_path, capsys):
-    renamed = Path(shutil.copytree(trained_tiny.parent / "tiny.zarr", tmp_path / "renamed.zarr"))
-    document = json.loads((renamed / "zarr.json").read_text())
-    document["attributes"]["sources"] = ["gauche", "droite"]
-    (renamed / "zarr.json").write_text(json.dumps(document))
-    write_seal(renamed)
-    told = arguments(trained_tiny, tmp_path / "report", f"evaluate.store={renamed}")
-    assert run("", evaluate.main, told) == 0
-    assert "renamed since the training" in capsys.readouterr().out
-    before, after = (
-        json.loads((folder / "metrics.json").read_text())
-        for folder in (judged[0], tmp_path / "report")
-    )
-    assert after == before
-
-
 def test_the_report_says_what_was_judged_and_which_streams_are_used(judged):
     """One test episode: nothing can be drawn anew, and the report says so."""
     report, said = judged
@@ -128,43 +109,6 @@ def test_the_report_says_what_was_judged_and_which_streams_are_used(judged):
     name, tested = next(iter(document["on"]["test"].items()))
     assert tested["ticks"] == [0, 30] and tested["group"] == name
     assert document["on"]["execute"] == 1
-
-
-def test_streams_are_left_alone_where_nobody_asks(trained_tiny, tmp_path, reports):
-    """DVC misses no file of such an evaluation either."""
-    listed = re.findall(r"evaluate\.output}/([\w.]+)", (ROOT / "dvc.yaml").read_text())
-    output = tmp_path / "report"
-    assert run("", evaluate.main, arguments(trained_tiny, output)) == 0
-    pictures = {f"{picture.name}.png" for picture in reports[0].blocks(Picture)}
-    assert len(listed) > 4 and set(listed) <= pictures | {file.name for file in output.iterdir()}
-    assert (output / "streams.csv").read_text().count("\n") == 1
-
-
-@pytest.mark.usefixtures("reports")
-def test_a_sampling_policy_is_judged_on_one_sample(trained_tiny: Path, tmp_path: Path) -> None:
-    head = tmp_path / "head"
-    own = (
-        "train_head.model_type=flow_matching",
-        f"train_head.output={head}",
-        f"train_head.logs={tmp_path / 'logs'}",
-        f"evaluate.checkpoint={head}",
-    )
-    output = tmp_path / "report"
-    assert run("", train_head.main, arguments(trained_tiny, output, *own)) == 0
-    found = []
-    for samples in (1, 8):
-        told = arguments(trained_tiny, output, *own, f"evaluate.samples={samples}")
-        assert run("", evaluate.main, told) == 0
-        document = json.loads((output / "judged.json").read_text())
-        assert document["policy"]["samples"] == samples
-        assert document["drawn"] == {"samples": samples, "batch_size": 64}
-        found.append(json.loads((output / "metrics.json").read_text()))
-    one, many = found
-    assert "samples" not in one
-    error = many["chunk"]["overall"]["policy"]["value"]
-    assert error == many["samples"]["one"]["value"] != one["chunk"]["overall"]["policy"]["value"]
-    assert many["samples"]["mean_of_n"]["value"] < error
-    assert many["samples"]["best_of_n"]["value"] < error
 
 
 def test_the_rollouts_of_this_policy_are_linked_though_they_come_later(
