@@ -1,7 +1,6 @@
 """The experiments that the documentation's tables come from."""
 
 import json
-import math
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -9,16 +8,13 @@ from unittest.mock import patch
 
 import numpy as np
 import pytest
-import torch
 
-from experiments import closed_loop, sight
+from experiments import closed_loop
 from experiments.recipes import (
     RECIPES,
     ROLLOUTS,
     STORES,
     TABLES,
-    _with_motion,
-    _with_motion_names,
     store_settings,
 )
 from pipeline.base.config import load_params
@@ -89,24 +85,3 @@ def test_a_finished_table_is_told_from_its_files(done, monkeypatch, capsys):
 def test_more_episodes_are_rolled_out_again(done, monkeypatch, capsys):
     with pytest.raises(AssertionError, match="all is done already"):
         run(monkeypatch, capsys, "experts", "--out", str(done), "--episodes", "60")
-
-
-def test_own_motion_is_how_far_each_channel_is_from_now() -> None:
-    kinds = ("deg", "plain", "rotation", "rotation", "rotation")
-    states = torch.tensor([[[10.0, 5.0, -179.0, 0, 0], [11.0, 7.0, 180.0, 0, 0]]])
-    moved = _with_motion(states, kinds)[..., -5:]
-    degree = math.radians(1)
-    wanted = [[-math.sin(degree), -2.0, math.sin(degree), 0, 0], [0.0] * 5]
-    torch.testing.assert_close(moved[0], torch.tensor(wanted), atol=1e-5, rtol=0)
-    assert len(_with_motion_names(["a"] * 5, kinds)) == _with_motion(states, kinds).shape[-1]
-
-
-def test_sight_errs_by_what_features_do_not_tell() -> None:
-    rng = np.random.default_rng(0)
-    offset = rng.uniform(-4, 4, (600, 2))
-    noisy = offset + 0.3 * rng.standard_normal(offset.shape)
-    features = np.stack([noisy @ rng.normal(size=(2, 6)) for _ in range(3)], axis=1)
-    told = sight._told(features.astype(np.float32), offset, np.arange(600) // 10)
-    assert told["sigma_mm"] == pytest.approx([0.3, 0.3], abs=0.03) and told["slots"] == 3
-    blind = sight._told(rng.normal(size=(600, 1, 4)).astype(np.float32), offset, np.arange(600))
-    assert blind["sigma_mm"] == pytest.approx([2.3, 2.3], abs=0.15)

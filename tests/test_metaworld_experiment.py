@@ -55,19 +55,3 @@ def test_a_set_is_what_the_expert_did_and_is_recorded_once(tmp_path: Path) -> No
     other = asked.model_copy(update={"episodes": 3})
     with pytest.raises(ConfigError, match=r"record.json: .*episodes 2"):
         record(tmp_path, [other], jobs=1)
-
-
-def test_every_variant_gives_params_that_can_be_read(tmp_path: Path) -> None:
-    from experiments.metaworld.protocol import _PARAMS, VARIANTS, Run
-
-    text = _PARAMS.read_text(encoding="utf-8").replace("{out}", str(tmp_path))
-    (tmp_path / "params.yaml").write_text(text, encoding="utf-8")
-    policies = [*Run(tmp_path, tuple(VARIANTS), seeds=2).policies()]
-    assert len({policy.folder for policy in policies}) == len(policies)
-    stores: dict[Path, set[str]] = {}
-    for policy in policies:
-        params = policy.params()
-        assert params.rollout.environment == tuple(f"metaworld:{task}" for task in policy.tasks)
-        features = f"{params.vlm} {params.data}"
-        stores.setdefault(params.extract.store, set()).add(features)
-    assert all(len(features) == 1 for features in stores.values()), "a store has one kind of rows"

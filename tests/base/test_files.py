@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from pipeline.base import files
 from pipeline.base.errors import CheckpointIncomplete, DiskFull
 from pipeline.base.files import (
     OutputKind,
@@ -122,6 +123,18 @@ def test_a_damaged_document_is_named(tmp_path: Path, content: str) -> None:
     path.write_text(content)
     with pytest.raises(CheckpointIncomplete, match=r"d\.json: .*Copy it again"):
         read_document(path, dict)[1]
+
+
+def test_only_a_document_with_its_digest_may_be_as_long_as_a_long_run(tmp_path, monkeypatch):
+    for limit in ("MOST_WEIGHT", "_MOST_WEIGHT"):  # so that the document is a hundredth as long
+        monkeypatch.setattr(files, limit, getattr(files, limit) // 100)
+    path = tmp_path / "d.json"
+    document = {"rows": [[step, {"loss": 0.5}] for step in range(2000)]}
+    write_with_digest(path, document)
+    assert read_document(path, dict)[1] == document
+    write_document(path, document)
+    with pytest.raises(CheckpointIncomplete, match=r"d\.json: expected a document of weight"):
+        read_document(path, dict)
 
 
 def test_tensors_come_back_and_damage_is_found(tmp_path: Path) -> None:

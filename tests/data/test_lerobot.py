@@ -467,6 +467,15 @@ def test_two_cameras_that_would_be_one_view_are_refused(seven):
     assert open_all(root)[0].view_names() == ["top"]
 
 
+@pytest.mark.parametrize(
+    "entries", [{"video_info": {"video.is_depth_map": True}}, {"info": {"is_depth_map": 1}}]
+)
+def test_a_depth_map_is_no_view(seven, entries):
+    root = seven(features={"observation.images.depth": camera(**entries)})
+    for recording in open_all(root):
+        assert recording.view_names() == list(recording.cameras()) == ["top"]
+
+
 def test_a_stale_file_index_is_seen_through(tmp_path, write):
     root = write.lerobot(tmp_path / "set", "v3.0", file_of=[0, 0, 1])
     good = [r.state().values for r in open_all(root)]
@@ -584,6 +593,13 @@ def test_files_of_episodes_are_all_read_and_none_is_refused(tmp_path, write):
     path.unlink(), path.with_name("file-001.parquet").unlink()
     with refused(match="expected chunk-000/file-000"):
         open_all(root)
+
+
+def test_whole_numbers_may_be_stored_as_floats(tmp_path, write, column="length"):
+    root = write.lerobot(tmp_path / "set", "v3.0")
+    cells = pq.ParquetFile(root / EPISODES_V3).read()[column]
+    edit_v3(root, **{column: cells.cast(pa.float64()).to_pylist()})
+    assert [len(recording.action().values) for recording in open_all(root)] == [7, 5, 9]
 
 
 @pytest.mark.parametrize("version", VERSIONS[1:])

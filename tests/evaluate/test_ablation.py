@@ -11,6 +11,7 @@ import torch
 from pipeline.base.config import SplitParams, TrainHeadParams
 from pipeline.evaluate.ablation import (
     AblationStudy,
+    delays,
     evaluate_ablation,
     zeroed,
 )
@@ -156,6 +157,18 @@ def test_an_alteration_leaves_the_batch_and_the_other_streams_alone(store: Featu
     assert torch.equal(at_mean.sensor, torch.tensor(mean).float().expand(4, 3, 5))
     assert torch.equal(batch.sensor, before)
     assert at_mean.features is batch.features and at_mean.action is batch.action
+
+
+@pytest.mark.parametrize(("ticks", "how"), [(2, "delayed 330 ms"), (1, "delayed inf ms")])
+def test_the_time_between_episodes_is_no_step_of_ticks(tiny_store, tmp_path, ticks, how):
+    """Where recorded rows are the ticks, their median step says how long a delay is."""
+    store = FeatureStore.open(tiny_store(tmp_path, ticks=ticks))
+    store.attrs["action_hz"] = None
+    time = store.array("tick/time")
+    starts = 45.0 * np.arange(6)
+    time[::ticks] = starts
+    time[ticks - 1 :: ticks] = starts + (ticks - 1) * np.tile([0.1, 0.12], 3)
+    assert list(delays(store, "features")) == [how]
 
 
 def test_a_study_of_a_sampling_policy_is_of_few_samples(tiny_store: Make, tmp_path: Path) -> None:

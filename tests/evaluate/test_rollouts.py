@@ -168,6 +168,19 @@ def test_a_stream_that_is_off_says_nothing(monkeypatch: pytest.MonkeyPatch) -> N
         assert all(seen["slot_valid"].all() and seen["feature_age"].max() < 0.4 for seen in silent)
 
 
+def test_streams_that_a_policy_lacks_are_passed_over() -> None:
+    parts = made(features_enabled=False)
+    rollouts = rolled(parts, episodes=1, ablations=("features off", "state off"))
+    assert rollouts.controllers == ("policy", "state off", "expert")
+    # One whose store lacks sensor and state, so that they have no channels.
+    checkpoint, _, glance = made()
+    shape = replace(checkpoint.shape, sensor_channels=0, state_dim=0)
+    normal = replace(checkpoint.normalization, sensor=None, state=None)
+    policy = Policy(checkpoint.params, shape, normal).eval()
+    without = replace(checkpoint, shape=shape, normalization=normal)
+    assert len(rolled((without, policy, glance), episodes=1).of("policy")) == 1
+
+
 def test_an_action_that_is_no_number_stops_its_robot_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     parts = made()
     act, calls = parts[1].act, []

@@ -122,6 +122,17 @@ class TestIssues:
         assert page.verdict == "1 finding to look at before training"
         assert "verify" in blocks(page, "What to do next")[0].words
 
+    def test_an_episode_without_an_instruction(self, tiny_store, tmp_path, plant):
+        path = tiny_store(tmp_path, episodes=12)
+
+        def erase(text: np.ndarray) -> None:
+            start = FeatureStore.open(path).array("episode/text_start")[4]
+            at = text.tobytes().index(b"touch the dot", start)
+            text[at : at + 13] = ord(" ")
+
+        plant(path, "episode/text", erase)
+        assert kinds(look(path)) == [("no instruction", "left", "episode_004")]
+
     @pytest.mark.parametrize(("dtype", "value"), [("float32", np.inf), ("bfloat16", 0x7FC0)])
     def test_a_row_that_is_not_finite_is_an_error_and_left_out(
         self, tiny_store, tmp_path, plant, dtype, value
@@ -136,6 +147,12 @@ class TestIssues:
         plant(path, "vl/features", lambda rows: rows.__setitem__(slice(None), value))
         view = look(path)
         assert [(one.kind, one.severity) for one in view.issues] == 6 * [("not finite", "error")]
+
+    def test_what_is_not_finite_does_not_count_where_its_slot_is_invalid(self, path, plant):
+        plant(path, "vl/features", lambda rows: rows.__setitem__((34, 2), np.nan))
+        plant(path, "vl/slot_valid", lambda valid: valid.__setitem__((34, 2), 0))
+        view = look(path)
+        assert view.issues == ()
 
 
 @pytest.fixture(scope="module")

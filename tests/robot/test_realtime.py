@@ -455,6 +455,15 @@ def test_a_signal_stops_the_robot_and_none_breaks_off_the_stop(number: int | Non
             signal.signal(each, handler)
 
 
+def test_a_signal_that_the_process_passes_over_does_not_end_the_run() -> None:
+    kept = signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    try:
+        arm = Arm(moves=lambda tick: signal.raise_signal(signal.SIGTERM))
+        assert run_robot(arm, Brain(), replace(CALM, seconds=0.05)).kind == StopKind.TIME
+    finally:
+        signal.signal(signal.SIGTERM, kept)
+
+
 class Stubborn(Arm):
     """Its first `stop` fails."""
 

@@ -239,6 +239,21 @@ def test_every_way_to_fail_ends_the_episode_with_its_reason() -> None:
     assert len(short.knots) == MAX_TICKS + 1
 
 
+def test_a_needle_inside_is_held_sideways() -> None:
+    insertion = over_the_target()
+    while not insertion.inside:
+        insertion.step(down(0.15))
+    insertion.step(down(0.6))
+    calm_n = insertion.knots[-1].force_n
+    insertion.step(np.array([0.4, 0, 0, 0, 0, 0, 1.0]))
+    pulled = insertion.knots[-1].force_n
+    assert pulled > calm_n
+    # The gauge along the needle feels the friction of it.
+    depth = insertion.layout.tissue.layer_depth_mm - insertion.contact.layer_mm[-1:]
+    straight = insertion.layout.tissue.drag_n(depth)[0]
+    assert insertion.contact.force_n[-1] > straight + 0.02
+
+
 @pytest.mark.parametrize("action", [np.full(7, np.nan), np.zeros(6)])
 def test_an_action_that_is_none_is_refused(action: NDArray[np.float64]) -> None:
     with pytest.raises(ValueError, match="7 finite numbers"):

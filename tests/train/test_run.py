@@ -10,7 +10,7 @@ import pytest
 from pipeline.base.errors import CheckpointIncomplete, CheckpointMismatch, ConfigError
 from pipeline.base.files import read_document
 from pipeline.store import FeatureStore
-from pipeline.train.run import TRAINER_VERSION, finished_run, open_run
+from pipeline.train.run import RUN_FOLDER, TRAINER_VERSION, finished_run, open_run
 
 
 @pytest.fixture(scope="session")
@@ -167,6 +167,22 @@ def test_what_no_training_wrote_is_never_replaced(store, params):
     with pytest.raises(ConfigError, match="a training run that this project wrote"):
         open_run(params(), store)
     assert (output / "thesis.tex").exists()
+
+
+@pytest.mark.parametrize(("document", "beside"), [('{"sweep": 3}', "models"), ("{", "best")])
+def test_a_run_json_of_another_program_makes_no_training_run(store, params, document, beside):
+    output = params().output
+    output.mkdir()
+    (output / "run.json").write_text(document)
+    (output / "thesis.tex").write_text("years of work")
+    if beside:
+        (output / beside).mkdir()
+        (output / beside / "policy.json").write_text("{}")
+    if beside == "best":  # a run of ours whose run.json was damaged
+        assert RUN_FOLDER.owns(output)
+    else:
+        with pytest.raises(ConfigError, match="a training run that this project wrote"):
+            open_run(params(), store)
 
 
 def test_checkpoints_without_their_run_are_not_guessed_at(store, params, unfinished):

@@ -2,6 +2,7 @@
 
 import copy
 import json
+import shutil
 from typing import Any
 
 import pytest
@@ -200,6 +201,21 @@ def test_full_saves_a_complete_checkpoint(prepare, demo_checkpoint, tmp_path):
     whole = prepare(checkpoint=checkpoint)[0].model._model.language_model.layers[3]
     for one, other in zip(above.parameters(), whole.parameters(), strict=True):
         torch.testing.assert_close(one, other)
+
+
+def test_full_keeps_the_dtype_of_its_base(prepare, demo_checkpoint, tmp_path):
+    base = shutil.copytree(demo_checkpoint, tmp_path / "base")
+    model = Qwen2_5_VLForConditionalGeneration.from_pretrained(base, dtype=torch.bfloat16)
+    model.save_pretrained(base)
+    frozen, rows, _ = prepare("bfloat16", dtype="bfloat16", checkpoint=str(base))
+    live = _live(frozen, method="full")
+    _stir(live)
+    live.save(tmp_path / "tuned")
+    saved = load_file(tmp_path / "tuned" / "model.safetensors")
+    assert {tensor.dtype for tensor in saved.values()} == {torch.bfloat16}
+    again = prepare("bfloat16", dtype="bfloat16", checkpoint=str(tmp_path / "tuned"))[2]
+    features, valid = live.eval()(rows)
+    assert _relative(features, again.float())[valid].max() < BF16_TOLERANCE
 
 
 @pytest.mark.parametrize("method", ["lora", "full"])

@@ -98,6 +98,16 @@ def test_contact_begins_where_the_force_rises_and_not_where_it_creeps(base: Epis
     assert stop > time[2740]
 
 
+def test_wrenches_count_by_their_length(base: EpisodeView) -> None:
+    rng = np.random.default_rng(0)
+    time = np.arange(3000) / 500
+    wrench = rng.normal([0.3, -9.8, 1.0], 0.01, (3000, 3))
+    wrench[2000:2500] += [0.2, 0.2, 0.2]
+    view = view_of(base, time, wrench, ("fx", "fy", "fz"))
+    ((start, stop),) = contacts(view)
+    assert (start, stop) == pytest.approx((time[2000], time[2500]), abs=0.03)
+
+
 def test_no_force_no_contact(base: EpisodeView) -> None:
     assert contacts(replace(base, sensor=None)) == []
     view = view_of(base, np.arange(100) / 10, np.linspace(0, 9, 100), ("depth",))
