@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from pipeline.base.config import Level
 from pipeline.simulation.arm import LAG_S, orientation
-from pipeline.simulation.expert import NOT_ALIGNED_MM, REACTION_TICKS
+from pipeline.simulation.demonstrator import NOT_ALIGNED_MM, REACTION_TICKS
 from pipeline.simulation.insertion import (
     AT_LAYER_MM,
     FORCE_LIMIT_N,
@@ -19,7 +19,7 @@ from pipeline.simulation.insertion import (
     TICK_S,
     NeedleInsertion,
 )
-from pipeline.simulation.layout import WORKSPACE_MM, InsertionLayout, draw_layout
+from pipeline.simulation.insertion_layout import WORKSPACE_MM, InsertionLayout, draw_layout
 from pipeline.simulation.needle_sensor import BIN_MM
 from pipeline.simulation.rendering import VIEWS, render
 

@@ -11,7 +11,7 @@ import pytest
 from PIL import Image
 
 from pipeline.base.errors import Issue
-from pipeline.look.recording.episode import EpisodeView
+from pipeline.look.recording.episode import LoadedRecording
 
 Find = Callable[..., tuple[Issue, ...]]
 Copied = Callable[[str], Path]
@@ -135,7 +135,9 @@ class TestChannels:
         assert "joint_3 leaps to 360 deg (row " in issue.message and "1 such rows" in issue.message
 
 
-def test_a_recording_may_be_very_short(copied: Copied, look: Callable[..., EpisodeView], issues_of):
+def test_a_recording_may_be_very_short(
+    copied: Copied, look: Callable[..., LoadedRecording], issues_of
+):
     folder = copied("raw")
     for view in ("View1", "View2", "View5"):
         for path in frames(folder, view)[1:]:

@@ -13,7 +13,7 @@ from pipeline.data import Channels, Stream
 from pipeline.look.page.blocks import Picture
 from pipeline.look.recording.cameras import camera_blocks, draw_views
 from pipeline.look.recording.clocks import Clock, clock_blocks, draw_lanes
-from pipeline.look.recording.episode import EpisodeView
+from pipeline.look.recording.episode import LoadedRecording
 from pipeline.look.recording.streams import (
     draw_motion,
     draw_sensor,
@@ -31,7 +31,7 @@ PARAMS = Params.model_validate(
 )
 
 
-def test_views_are_shown_at_ticks_with_the_age_of_each_frame(view: EpisodeView) -> None:
+def test_views_are_shown_at_ticks_with_the_age_of_each_frame(view: LoadedRecording) -> None:
     assert view.timeline is not None
     figure = draw_views(view, [3, 5])
     assert [len(axis.images) for axis in figure.axes] == [1] * 6
@@ -40,7 +40,7 @@ def test_views_are_shown_at_ticks_with_the_age_of_each_frame(view: EpisodeView) 
     assert figure.axes[0].get_xlabel() == f"{1000 * age:.0f} ms old"
 
 
-def test_names_are_written_as_they_are(view: EpisodeView) -> None:
+def test_names_are_written_as_they_are(view: LoadedRecording) -> None:
     names = ("cost_$5_$6", "$\\foo$", "<b>x</b>", "_hidden", "100%")
     stream = Stream(
         Channels(names, ("$\\bar$",) * 5), np.arange(9) / 9, np.eye(9, 5, dtype=np.float32)
@@ -56,12 +56,12 @@ def test_names_are_written_as_they_are(view: EpisodeView) -> None:
 
 
 @pytest.fixture
-def draw(view: EpisodeView) -> Callable[..., Picture]:
+def draw(view: LoadedRecording) -> Callable[..., Picture]:
     """Makes pictures of that episode."""
     return lambda name, caption, draw: Picture(name, caption, lambda: draw(view))
 
 
-def test_lanes_show_every_clock_once_with_its_gap(view: EpisodeView) -> None:
+def test_lanes_show_every_clock_once_with_its_gap(view: LoadedRecording) -> None:
     (axis,) = draw_lanes(view).axes
     names = [label.get_text() for label in axis.get_yticklabels()]
     views = ["view View1", "view View2", "view View5"]
