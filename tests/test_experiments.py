@@ -1,8 +1,6 @@
 """The experiments that the documentation's tables come from."""
 
 import json
-import math
-import time
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -10,16 +8,13 @@ from unittest.mock import patch
 
 import numpy as np
 import pytest
-import torch
 
-from experiments import closed_loop, sight
+from experiments import closed_loop
 from experiments.recipes import (
     RECIPES,
     ROLLOUTS,
     STORES,
     TABLES,
-    _with_motion,
-    _with_motion_names,
     store_settings,
 )
 from pipeline.base.config import load_params
@@ -87,89 +82,6 @@ def test_a_finished_table_is_told_from_its_files(done, monkeypatch, capsys):
     assert low < rate < high and high - low == pytest.approx(0.16, abs=0.02)  # of 100, at 0.8
 
 
-def test_other_params_want_another_folder(done, monkeypatch, capsys):
-    run(monkeypatch, capsys, "experts", "--out", str(done), "--episodes", "50")
-    (done / "params.yaml").write_text("data: {}")
-    with pytest.raises(SystemExit, match="Name another folder"):
-        run(monkeypatch, capsys, "experts", "--out", str(done), "--episodes", "50")
-
-
 def test_more_episodes_are_rolled_out_again(done, monkeypatch, capsys):
     with pytest.raises(AssertionError, match="all is done already"):
         run(monkeypatch, capsys, "experts", "--out", str(done), "--episodes", "60")
-
-
-def test_worth_ranks_success_against_errors(done, monkeypatch, capsys):
-    told = run(monkeypatch, capsys, "worth", "--out", str(done))
-    assert (done / "worth.png").read_bytes().startswith(b"\x89PNG")
-    assert len(told["policies"]) == 12
-    assert all(correlation < -0.8 for correlation in told["rank_correlation"].values())
-
-
-def test_worth_of_too_few_policies_says_what_to_do(tmp_path, monkeypatch, capsys):
-    with pytest.raises(SystemExit, match="make a table"):
-        run(monkeypatch, capsys, "worth", "--out", str(tmp_path))
-
-
-def test_staleness_draws_success_against_latency(done, monkeypatch, capsys):
-    late = done / "as-it-is-0" / "300 ms"
-    late.mkdir()
-    (late / "episodes.csv").write_text("success,lateral_mm\nTrue,0.1\nFalse,3")
-    told = run(monkeypatch, capsys, "staleness", "--out", str(done))["by_latency_ms"]
-    assert (done / "staleness.png").read_bytes().startswith(b"\x89PNG")
-    assert list(told["anchored (default)"]) == ["0", "300"]
-    assert told["anchored (default)"]["300"][0] == 0.5
-
-
-def test_staleness_of_nothing_says_what_to_do(tmp_path, monkeypatch, capsys):
-    with pytest.raises(SystemExit, match="Make the table `latency`"):
-        run(monkeypatch, capsys, "staleness", "--out", str(tmp_path))
-
-
-def test_a_rollout_that_was_cut_off_is_done_again(done, monkeypatch, capsys):
-    (done / "gated-1" / "on time" / "beside.csv").unlink()
-    with pytest.raises(AssertionError, match="all is done already"):
-        run(monkeypatch, capsys, "experts", "--out", str(done), "--episodes", "50")
-
-
-def test_after_a_failure_nothing_more_begins(tmp_path, monkeypatch, capsys):
-    begun: list[str] = []
-
-    def fail(wanted: Any, name: str, seed: int) -> None:
-        begun.append(name)
-        time.sleep(0.1)
-        raise ValueError(f"{name} cannot be trained")
-
-    monkeypatch.setattr(closed_loop, "_run_apart", fail)
-    with pytest.raises(ValueError, match="cannot be trained"):
-        run(monkeypatch, capsys, "experts", "--out", str(tmp_path), "--jobs", "1")
-    assert len(begun) < 4  # of twelve
-
-
-def test_own_motion_is_how_far_each_channel_is_from_now() -> None:
-    kinds = ("deg", "plain", "rotation", "rotation", "rotation")
-    states = torch.tensor([[[10.0, 5.0, -179.0, 0, 0], [11.0, 7.0, 180.0, 0, 0]]])
-    moved = _with_motion(states, kinds)[..., -5:]
-    degree = math.radians(1)
-    wanted = [[-math.sin(degree), -2.0, math.sin(degree), 0, 0], [0.0] * 5]
-    torch.testing.assert_close(moved[0], torch.tensor(wanted), atol=1e-5, rtol=0)
-    assert len(_with_motion_names(["a"] * 5, kinds)) == _with_motion(states, kinds).shape[-1]
-
-
-def test_sight_errs_by_what_features_do_not_tell() -> None:
-    rng = np.random.default_rng(0)
-    offset = rng.uniform(-4, 4, (600, 2))
-    noisy = offset + 0.3 * rng.standard_normal(offset.shape)
-    features = np.stack([noisy @ rng.normal(size=(2, 6)) for _ in range(3)], axis=1)
-    told = sight._told(features.astype(np.float32), offset, np.arange(600) // 10)
-    assert told["sigma_mm"] == pytest.approx([0.3, 0.3], abs=0.03) and told["slots"] == 3
-    blind = sight._told(rng.normal(size=(600, 1, 4)).astype(np.float32), offset, np.arange(600))
-    assert blind["sigma_mm"] == pytest.approx([2.3, 2.3], abs=0.15)
-
-
-def test_sight_looks_until_the_needle_is_inside() -> None:
-    frames, offset_mm, episode = sight._look(2)
-    assert len(frames) == len(offset_mm) == len(episode) and set(episode) == {0, 1}
-    missed = np.hypot(*offset_mm.T)
-    assert missed.max() > 2.0
-    assert all(missed[episode == number][-1] < 1.0 for number in (0, 1))

@@ -9,9 +9,7 @@ from torch.nn.attention import SDPBackend, sdpa_kernel
 from torch.utils.flop_counter import FlopCounterMode
 from transformers import Qwen2_5_VLForConditionalGeneration
 
-from benchmarks.flops import peak_flops, row_flops, row_tokens
-from benchmarks.real_shape import random_model, real_config, write_shell
-from pipeline.vlm.checkpoint_folder import read_config
+from benchmarks.flops import row_flops
 
 
 @pytest.fixture(scope="module")
@@ -51,51 +49,3 @@ def test_a_row_costs_what_torch_counts(demo_model, image_size, images):
     found = row_flops(demo_model.config, image_size, images, text_tokens=50, head=True)
     # Rotary positions are a product too, of a few numbers a token.
     assert sum(found.values()) == pytest.approx(expected, rel=2e-4)
-
-
-def test_the_decoder_of_the_real_shape_costs_what_torch_counts():
-    config = real_config()
-    model = random_model(config, "meta")
-    with torch.device("meta"), sdpa_kernel(SDPBackend.MATH):
-        embedded = torch.empty(1, 937, 2048, dtype=torch.bfloat16)
-        positions = torch.zeros(3, 1, 937, dtype=torch.int64)
-        with FlopCounterMode(display=False) as counter:
-            model.model.language_model(
-                inputs_embeds=embedded, position_ids=positions, use_cache=False
-            )
-    parts = row_flops(config, (364, 644), images=3, text_tokens=40)
-    found = parts["decoder_linear"] + parts["decoder_attention"]
-    assert row_tokens(config, (364, 644), 3, 40) == 937
-    assert found == pytest.approx(counter.get_total_flops(), rel=2e-4)
-
-
-def test_pooling_is_one_product():
-    config = real_config()
-    without = row_flops(config, (364, 644), 3, 40)
-    pooled = row_flops(config, (364, 644), 3, 40, slots=49)
-    assert sum(pooled.values()) - sum(without.values()) == 2 * 49 * 937 * 2048
-
-
-def test_the_real_shape_has_the_parameters_of_the_released_checkpoint():
-    model = random_model(real_config(), "meta")
-    assert sum(parameter.numel() for parameter in model.parameters()) == 3_754_622_976
-    assert model.dtype == torch.bfloat16
-    assert not any(parameter.requires_grad for parameter in model.parameters())
-
-
-def test_the_shell_is_a_checkpoint_folder_of_the_real_shape(tmp_path):
-    config = write_shell(tmp_path / "shell")
-    read = read_config(tmp_path / "shell")
-    assert read.text_config.hidden_size == 2048
-    assert read.text_config.num_hidden_layers == 36
-    assert read.image_token_id == config.image_token_id < 1600
-
-
-def test_peaks_by_name():
-    for name, tera in (
-        ("NVIDIA A100-SXM4-80GB", 312),
-        ("NVIDIA H100 80GB HBM3", 989),
-        ("NVIDIA H100 PCIe", 756),
-    ):
-        assert peak_flops(name) == tera * 1e12
-    assert peak_flops("NVIDIA GeForce GTX 1080") is None

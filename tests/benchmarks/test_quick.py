@@ -2,9 +2,7 @@
 
 import importlib
 import json
-import os
 import runpy
-import subprocess
 import sys
 import tempfile
 from pathlib import Path
@@ -19,7 +17,7 @@ BENCHMARKS = {
     if '__name__ == "__main__"' in path.read_text(encoding="utf-8")
 }
 ALONE = "gather"
-"""It forks, which a process with the threads of other tests should not."""
+"""It forks, which a process with the threads of other tests should not: run it by hand."""
 
 
 def assert_is_a_report(out: str, name: str) -> None:
@@ -33,7 +31,7 @@ def assert_is_a_report(out: str, name: str) -> None:
         assert {"what", "found", "wanted", "reached"} <= set(target)
 
 
-SLOW = {"extract", "head_latency", "reading", "robot_jitter"}
+SLOW = {"extract", "head_latency", "reading", "robot_jitter", "slots"}
 
 
 @pytest.mark.parametrize(
@@ -54,22 +52,3 @@ def test_a_quick_run_prints_one_line_of_json(name, tmp_path, monkeypatch, capfd)
     runpy.run_module(f"benchmarks.{name}", run_name="__main__", alter_sys=True)
     assert_is_a_report(capfd.readouterr().out, name)
     assert not list(tmp_path.iterdir()), "it cleans up"
-
-
-@pytest.mark.slow
-@pytest.mark.extra
-def test_the_command_that_a_report_names_is_that_of_its_run(tmp_path):
-    for contender in ("h5py", "lmdb", "tensorstore"):
-        pytest.importorskip(
-            contender, reason=f"{contender} is not installed: pip install -e '.[bench]'"
-        )
-    done = subprocess.run(
-        [sys.executable, "-m", f"benchmarks.{ALONE}", "--quick"],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        check=False,
-        env=os.environ | {"TMPDIR": str(tmp_path)},
-    )
-    assert done.returncode == 0, done.stderr[-2000:]
-    assert_is_a_report(done.stdout, ALONE)

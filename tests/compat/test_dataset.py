@@ -10,12 +10,9 @@ import pytest
 import torch
 from torch.utils.data import DataLoader
 
-from pipeline.base.config import Source, SplitParams, TrainHeadParams
+from pipeline.base.config import Source, TrainHeadParams
 from pipeline.base.errors import ConfigError, RecordingError, StoreIncomplete, StoreMismatch
 from pipeline.base.observation import Observation
-from pipeline.compat.unified import QwenVLAUnified
-from pipeline.data import open_recordings
-from pipeline.data.timeline import build_timeline
 from pipeline.datasets import (
     AsyncInsertionMeca500DatasetWithSensor,
     NewAsyncInsertionDataset,
@@ -25,7 +22,6 @@ from pipeline.datasets import (
     unified_collate_fn,
 )
 from pipeline.store import Batch, FeatureStore
-from pipeline.train.split import split_by_episode
 
 SMALL = TrainHeadParams.model_validate(
     {
@@ -77,34 +73,6 @@ def equal(a: Any, b: Any) -> bool:
 
 
 class TestItems:
-    def test_an_item_is_what_the_timeline_says(self, recordings, new):
-        source = Source(name="new", path=str(recordings / "new"))
-        recording = open_recordings([source]).recordings[1]
-        state, sensor = recording.state(), recording.sensor()
-        assert state is not None and sensor is not None
-        line = build_timeline(recording, 10.0, 3, "rotvec", state, sensor)
-        offset = new.episodes[1].ticks.start
-        for tick in (0, 1, 7, len(line.time) - 3):
-            item = new[offset + tick]
-            now = line.time[tick]
-            assert float(item["time"]) == now
-            readings = sensor.values[sensor.time <= now][-65:]
-            assert item["sensor_valid"] == len(readings)
-            assert np.array_equal(item["sensor"][65 - len(readings) :], readings)
-            assert not item["sensor"][: 65 - len(readings)].any()
-            states = state.values[state.time <= now][-100:]
-            assert item["state_valid"] == len(states)
-            assert np.array_equal(item["state"][100 - len(states) :], states)
-            ahead = line.action[tick : tick + 8]
-            assert np.array_equal(item["action"][: len(ahead)], ahead)
-            assert item["action_valid"].sum() == len(ahead)
-            assert item["instruction"] == recording.instruction
-            shown = line.vl_time[line.vl_row[tick]]
-            for view, camera in recording.cameras().items():
-                index = int(np.flatnonzero(camera.time <= shown)[-1])
-                (frame,) = camera.read([index])
-                assert np.array_equal(item["images"][view], frame)
-
     def test_frames_and_features_come_with_the_same_streams(self, live, cached):
         assert len(live) == len(cached) == len(live.ticks)
         items = list(range(0, len(live), 5))
@@ -180,17 +148,6 @@ class TestOneActionRotation:
         with pytest.raises(StoreMismatch, match=r"action.*da.*rx|action.*rx.*da"):
             UnifiedVLADataset([old, recordings / "new"], action_rotation="rotvec")
 
-    def test_real_recordings_of_both_formats(self, shared_data: Path) -> None:
-        root = shared_data / "insertion"
-        data = UnifiedVLADataset([root / "old", root / "new"])
-        assert {episode.format for episode in data.episodes} == {"old", "new"}
-        batch = unified_collate_fn([data[item] for item in range(0, len(data), 7)])
-        assert batch.images is not None and all(batch.images)
-        assert batch.action.shape[1:] == (8, 7)
-        assert batch.sensor.shape[1:] == (65, 1026)
-        # The old recordings have no robot states: Euler deltas for both.
-        assert data.store.streams["action"]["names"][3:6] == ["da", "db", "dr"]
-
 
 class TestStore:
     def test_an_alias_takes_the_episodes_of_its_format(self, extracted, recordings):
@@ -235,15 +192,6 @@ class TestErrors:
         with pytest.raises(StoreIncomplete, match=r"nowhere\.zarr"):
             UnifiedVLADataset(store=tmp_path / "nowhere.zarr")
 
-    def test_every_broken_episode_is_named(self, copied) -> None:
-        folder = copied("new")
-        for metadata in folder.glob("**/metadata.json"):
-            metadata.write_text("{")
-        with pytest.raises(
-            RecordingError, match=r"(?s)2 episodes.*_092140/metadata.*_092320/metadata"
-        ):
-            UnifiedVLADataset(folder)
-
 
 class TestSplit:
     def test_whole_episodes_on_either_side_and_the_store_stays(self, cached):
@@ -256,29 +204,6 @@ class TestSplit:
         assert sides[0] and sides[1] and not sides[0] & sides[1]
         loader = DataLoader(held_out, batch_size=50, collate_fn=unified_collate_fn)
         assert len(next(iter(loader))) == min(50, len(held_out))
-
-    def test_the_same_with_frames_as_with_features_under_the_names_of_the_store(
-        self, recordings, extracted
-    ):
-        named = [
-            Source(name=name, path=str(recordings / folder))
-            for name, folder in (("first", "old"), ("second", "new"))
-        ]
-        live, cached = UnifiedVLADataset(named), UnifiedVLADataset(store=extracted)
-        for val_fraction in (0.0, 0.3, 0.8):
-            sides = [[side.indices for side in data.split(val_fraction)] for data in (live, cached)]
-            assert sides[0] == sides[1]
-            trained = split_by_episode(extracted, SplitParams(val=val_fraction, test=0))
-            assert sides[1] == [trained.train.tolist(), trained.val.tolist()]
-
-    def test_one_recording_in_two_places_is_on_one_side(self, recordings: Path) -> None:
-        new = str(recordings / "new")
-        twice = [Source(name="a", path=new), Source(name="b", path=new)]
-        data = UnifiedVLADataset(twice)
-        _, held_out = data.split(0.5)
-        held = set(held_out.indices)
-        half = len(data) // 2
-        assert held and {item + half for item in held if item < half} <= held
 
 
 class TestWorkers:
@@ -304,21 +229,3 @@ class TestWorkers:
         alias = AsyncInsertionMeca500DatasetWithSensor(store=cached.store)
         again = pickle.loads(pickle.dumps(alias))
         assert type(again) is type(alias) and np.array_equal(again.ticks, alias.ticks)
-
-
-class TestModels:
-    def test_the_unified_model_says_the_same_of_frames_and_of_features(
-        self, live, cached, demo_checkpoint
-    ):
-        torch.manual_seed(0)
-        model = QwenVLAUnified(
-            "regression",
-            vl_model_name=str(demo_checkpoint),
-            image_resize_height=56,
-            image_resize_width=56,
-            views=cached.store.streams["views"],
-            vlm={"dtype": "float32"},
-            **SMALL.model_dump(include={"sensor_encoder", "state_encoder", "expert"}),
-        ).eval()
-        losses = [model(**data.__getitems__([0, 1, 90, 150]).inputs()) for data in (live, cached)]
-        assert losses[0].item() == pytest.approx(losses[1].item(), rel=1e-3)

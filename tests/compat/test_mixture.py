@@ -6,8 +6,6 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
-from hypothesis import strategies as st
 
 from pipeline.base.errors import ConfigError
 from pipeline.datasets import (
@@ -16,7 +14,6 @@ from pipeline.datasets import (
     create_unified_dataloader,
     create_weighted_async_dataloader,
 )
-from pipeline.store import FeatureStore
 
 
 def batches(sizes: dict[str, int], **weights: float) -> MixtureBatches:
@@ -29,20 +26,6 @@ def batches(sizes: dict[str, int], **weights: float) -> MixtureBatches:
 
 
 class TestShares:
-    @given(old=st.integers(1, 500), new=st.integers(1, 500), step=st.integers(0, 400))
-    def test_are_1_to_3_within_a_draw_whatever_the_sizes(self, old, new, step):
-        drawn = batches({"old": old, "new": new}, old=1.0, new=3.0)
-        steps = range(step, step + 8)
-        of_old = sum(item < old for step in steps for item in drawn.batch(step))
-        assert abs(of_old - 56 / 4) <= 1 + 1e-9
-        assert abs(sum(item < old for item in drawn.batch(step)) - 7 / 4) <= 1 + 1e-9
-
-    def test_a_weight_of_0_leaves_a_source_out(self):
-        drawn = batches({"old": 20, "new": 30}, old=0.0, new=3.0)
-        assert min(drawn.batch(5)) >= 20
-        with pytest.raises(ConfigError, match=r"'old': 20.*'old': 0\.0"):
-            batches({"old": 20}, old=0.0)
-
     def test_what_cannot_be_drawn_is_refused_in_the_words_of_the_caller(self) -> None:
         items = {"old": np.arange(3), "new": np.arange(3, 9)}
         for weights, batch_size, message in (
@@ -86,16 +69,6 @@ def loader(recordings: Path) -> Any:
 
 
 class TestLoader:
-    def test_an_epoch_that_is_broken_off_is_not_repeated(self, extracted: FeatureStore) -> None:
-        for workers in (0, 1):
-            loader = create_unified_dataloader(store=extracted, batch_size=40, num_workers=workers)
-            batches = loader.batch_sampler
-            steps = len(batches)
-            for epoch in range(3):
-                batch = next(iter(loader))
-                items = batches.batch(epoch * steps)
-                assert batch.tick.tolist() == loader.dataset.ticks[items].tolist()
-
     def test_draws_old_and_new_recordings_1_to_3(self, loader: Any) -> None:
         formats = [episode.format for episode in loader.dataset.store.episodes]
         for _, batch in zip(range(4), loader, strict=False):

@@ -1,8 +1,6 @@
 """One model, live or cached: the same answer, the arguments it has always had, and it learns."""
 
 import pickle
-import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -11,7 +9,6 @@ import numpy as np
 import pytest
 import torch
 from numpy.typing import NDArray
-from PIL import Image
 from pydantic import ValidationError
 from torch import Tensor
 
@@ -23,7 +20,7 @@ from pipeline.compat.unified import (
     QwenVLAWithSensorDiffusion,
 )
 from pipeline.policy.expert import Guide
-from pipeline.policy.observation import LiveObservation, PolicyShape
+from pipeline.policy.observation import PolicyShape
 from pipeline.policy.policy import Trainable
 from pipeline.vlm.live import live_spec
 from pipeline.vlm.preparation import Preparer
@@ -113,22 +110,6 @@ def test_live_cached_and_mixed_give_the_same_chunk(build, images, streams):
     assert (other[0] - cached[0]).abs().max() > 1e-3, "the chunk depends on what is seen"
 
 
-def test_equal_samples_share_a_row(build: Make, images: list[Any]) -> None:
-    model = build()
-    observation = model.observe(images, TEXT)
-    assert isinstance(observation, LiveObservation)
-    assert observation.row_of.tolist() == [0, 1, 0, 2]
-    assert len(observation.rows) == 3
-    prompts = ["insert the needle", "stop", "retract", "retract"]
-    assert model.observe(images, prompts).row_of.tolist() == [0, 1, 2, 3]
-    pictures = [{view: Image.fromarray(f) for view, f in frames.items()} for frames in images]
-    assert model.observe(pictures, TEXT).row_of.tolist() == [0, 1, 0, 2]
-    batches: list[int] = []
-    model.load_vlm().register_forward_pre_hook(lambda _, given: batches.append(len(given[0])))
-    model.sample(observation, 3)
-    assert batches == [3]
-
-
 def test_what_is_not_given_is_missing(build: Make, streams: dict[str, Tensor]) -> None:
     model = build()
     observation = model.observe(sensor=streams["sensor"])
@@ -204,32 +185,6 @@ def test_images_text_and_streams_are_of_one_batch(build, images, streams):
             model(some, TEXT[:3], **streams)
 
 
-def test_a_fresh_model_acts_without_dropout(build, images, streams):
-    over: dict[str, Any] = {"expert": SMALL["expert"] | {"dropout": 0.5}, "drop_sensor": 0.5}
-    model = build(model_type="diffusion", finetune_vl="lora", **over).train()
-    model.policy.fusion.eval()
-    modes: list[bool] = []
-    for _ in range(2):
-        acted = [model(images, TEXT, **streams, generator=_generator()) for _ in range(2)]
-        assert torch.equal(*acted)
-        # Loaded by the first act, the model is in the mode of the whole.
-        assert model.training and model.policy.expert.training and not model.policy.fusion.training
-        assert model.vlm is not None and all(part.training for part in model.vlm.modules())
-        model.vlm.register_forward_pre_hook(lambda vlm, _: modes.append(vlm.training))
-    assert modes == [False, False]
-    assert torch.equal(model.eval()(images, TEXT, **streams, generator=_generator()), acted[0])
-
-    model.train()
-    actions = torch.randn(4, 8, 7)
-    losses = [model(**streams, actions=actions, generator=_generator()) for _ in range(2)]
-    assert losses[0] != losses[1], "learning drops out"
-    observation = model.observe(images, TEXT)
-    observation.row_of[0] = 9
-    with pytest.raises(IndexError):
-        model.act(observation)
-    assert model.training and model.policy.expert.training
-
-
 def test_it_is_trainable_and_gives_the_loss_where_actions_are_given(build, images, streams):
     model = build(model_type="diffusion")
     assert isinstance(model, Trainable)
@@ -256,27 +211,6 @@ def test_it_is_trainable_and_gives_the_loss_where_actions_are_given(build, image
 
 def _generator() -> torch.Generator:
     return torch.Generator().manual_seed(1)
-
-
-def test_tuning_lowers_the_loss(build: Make, images: list[Any]) -> None:
-    model = build(model_type="regression", finetune_vl="lora", lora_dropout=0.0).train()
-    # Only the vision-language model learns, and an optimizer sees it without asking for it.
-    model.policy.requires_grad_(False)
-    learns = [parameter for parameter in model.parameters() if parameter.requires_grad]
-    assert model.vlm is not None
-    assert len(learns) > 0
-    optimizer = torch.optim.AdamW(learns, lr=1e-2)
-    # The first and third sample see the same.
-    actions = torch.randn(3, 8, 7)[[0, 1, 0, 2]]
-    losses = []
-    for _ in range(8):
-        loss = model(images, TEXT, actions=actions)
-        optimizer.zero_grad()
-        loss.backward()
-        optimizer.step()
-        losses.append(loss.item())
-    # What a head with random weights lets through is small, but nothing here is noise.
-    assert losses[-1] < 0.98 * losses[0], losses
 
 
 @pytest.mark.parametrize("finetune_vl", ["none", "lora"])
@@ -336,16 +270,3 @@ def test_aliases_build_the_right_thing(build, alias, model_type, finetune_vl):
     assert model(sensor=torch.randn(1, 13, 9)).shape == (1, 4, 7)
     learns = any(parameter.requires_grad for parameter in model.load_vlm().parameters())
     assert learns == (finetune_vl == "full")
-
-
-def test_cached_features_need_no_transformers() -> None:
-    """Nor do the data sets and models of stage two."""
-    code = """
-import sys
-sys.modules["transformers"] = sys.modules["peft"] = None
-import pipeline.datasets, torch
-from pipeline.models import Policy, QwenVLAUnified
-model = QwenVLAUnified(sensor_encoder={"channels": [8], "heads": 1, "output_dim": 8})
-assert model.eval()(features=torch.randn(2, 1, 2048)).shape == (2, 8, 7)
-"""
-    subprocess.run([sys.executable, "-c", code], check=True, capture_output=True)

@@ -15,10 +15,9 @@ from hypothesis import strategies as st
 from pipeline.base.config import Source
 from pipeline.base.digests import file_digest
 from pipeline.base.errors import RecordingError
-from pipeline.data import content_digest, open_recording, open_recordings
+from pipeline.data import content_digest, open_recordings
 from pipeline.data.lerobot import action_kind
 from pipeline.data.lerobot_rows import read_clock
-from pipeline.data.lerobot_writer import LeRobotRows, write_data_set
 from pipeline.data.timeline import build_timeline
 from tests.data.conftest import EPISODES_V3, VIEW_KEY, edit_v3, open_all
 
@@ -384,19 +383,6 @@ def test_the_kind_of_the_actions_may_stand_beside_their_names(root):
         open_all(root)
 
 
-def test_a_set_gives_the_same_beside_a_twin(tmp_path, write, truth):
-    """The twin's episodes take their parents' names; neither sensor nor digest goes by them."""
-    alone, twin = (write.lerobot(tmp_path / "sets" / name) for name in ("a", "b"))
-    for root in (alone, twin):
-        save_sidecar(root, "sensor", 1, timestamps=np.arange(30) / 50, values=truth.sensor[:30])
-    recording, named_apart = open_all(alone)[1], open_all(tmp_path / "sets")[1]
-    assert (recording.id, named_apart.id) == ("episode_000001", "a/episode_000001")
-    np.testing.assert_array_equal(named_apart.sensor().values, truth.sensor[:30])
-    again = open_recording(named_apart.path, named_apart.format, named_apart.id)
-    digest = content_digest(recording, file_digest)
-    assert digest == content_digest(named_apart, file_digest) == content_digest(again, file_digest)
-
-
 def test_episodes_whose_files_are_absent_are_listed(tmp_path, write):
     root = write.lerobot(tmp_path / "set")
     (root / "data/chunk-000/episode_000001.parquet").unlink()
@@ -694,24 +680,3 @@ def test_what_is_no_file_is_named(seven, file, version, make):
     kind = "a folder" if make is Path.mkdir else "a pipe, socket or device"
     with refused(match=rf"{file}: expected a file, found {kind}"):
         open_all(root)
-
-
-def test_episodes_that_are_written_with_films_are_read_again(tmp_path):
-    rng = np.random.default_rng(0)
-    filmed = []
-    for shade, rows in ((40, 5), (200, 8)):
-        columns = {"action": rng.random((rows, 2)).astype(np.float32)}
-        columns["timestamp"] = (np.arange(rows) / 10).astype(np.float32)
-        film = np.full((rows, 48, 64, 3), (shade, 90, 30), np.uint8)
-        filmed.append(LeRobotRows(columns, {VIEW_KEY: film}))
-    features = {"action": {"names": ["dx", "dy"], "kind": "delta"}}
-    write_data_set(tmp_path / "set", iter(filmed), features, "push the T", 10, "arm")
-    for recording, written, shade in zip(
-        open_all(tmp_path / "set"), filmed, (40, 200), strict=True
-    ):
-        np.testing.assert_array_equal(recording.action().values, written.columns["action"])
-        assert recording.instruction == "push the T"
-        (camera,) = recording.cameras().values()
-        assert len(camera.time) == len(written.columns["timestamp"])
-        (frame,) = camera.read([0])
-        assert np.allclose(frame[24, 32], (shade, 90, 30), atol=5)

@@ -3,14 +3,11 @@
 import io
 import os
 import pickle
-import tempfile
 from collections import OrderedDict
 from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from pipeline.base.errors import RecordingError
 from pipeline.data.pickled import load_plain
@@ -308,31 +305,3 @@ def test_a_file_above_the_limit_is_not_read(tmp_path):
     path = save(tmp_path / "data.pkl", np.zeros(1000))
     with pytest.raises(RecordingError, match=r"data\.pkl: .*limits\.array_bytes"):
         load_plain(path, 1000)
-
-
-PLAIN = st.recursive(
-    st.none()
-    | st.booleans()
-    | st.integers(-(2**63), 2**64 - 1)
-    | st.floats(allow_nan=False)
-    | st.text()
-    | st.binary()
-    | st.floats(width=32, allow_nan=False).map(np.float32),
-    lambda inner: (
-        st.lists(inner)
-        | st.dictionaries(st.text() | st.integers(-9, 9), inner)
-        | st.tuples(inner, inner)
-        | st.frozensets(st.integers(-9, 9))
-    ),
-    max_leaves=20,
-)
-
-
-@settings(max_examples=40)  # of up to twenty leaves each
-@given(PLAIN, st.integers(3, 5))
-def test_it_gives_what_pickle_gives(content, protocol):
-    written = pickle.dumps(content, protocol)
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "data.pkl"
-        path.write_bytes(written)
-        assert load(path) == pickle.loads(written)

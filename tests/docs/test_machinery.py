@@ -2,7 +2,6 @@
 
 import re
 from pathlib import Path
-from xml.etree import ElementTree
 
 import pytest
 
@@ -18,16 +17,6 @@ def test_the_figures_are_as_they_are_drawn(machinery):
     for name, text in drawn.items():
         kept = (FIGURES / name).read_text(encoding="utf-8")
         assert kept == text, f"{name} is stale: python docs/machinery/draw.py"
-
-
-def test_a_figure_says_what_it_shows_and_names_its_colours():
-    for path in FIGURES.glob("*.svg"):
-        text = path.read_text(encoding="utf-8")
-        assert ElementTree.fromstring(text).findtext("{http://www.w3.org/2000/svg}title"), path
-        outside = re.sub(r"<style>.*?</style>", "", text, flags=re.DOTALL)
-        assert not re.search(r"#[0-9a-fA-F]{3,8}\b", outside), f"{path}: a colour of no page"
-        used = set(re.findall(r"var\(--([a-z]+)\)", outside))
-        assert used <= set(re.findall(r"--([a-z]+):", text)), path
 
 
 def test_the_site_knows_every_colour_of_the_figures(machinery):

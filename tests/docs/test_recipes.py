@@ -67,8 +67,8 @@ class Followed:
 
 
 @pytest.fixture(scope="module")
-def followed(tmp_path_factory: pytest.TempPathFactory) -> Followed:
-    """One copy and one run for all recipes: each is then also tried beside the others."""
+def project(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """One copy for all recipes: each is then also tried beside the others."""
     project = tmp_path_factory.mktemp("project")
     without = shutil.ignore_patterns("__pycache__")
     for folder in ("pipeline", "stages", "tests"):
@@ -77,6 +77,12 @@ def followed(tmp_path_factory: pytest.TempPathFactory) -> Followed:
         shutil.copy(ROOT / name, project / name)
     for page in ("reader", "expert", "pooling"):
         follow(RECIPES / f"{page}.md", project)
+    return project
+
+
+@pytest.fixture(scope="module")
+def followed(project: Path) -> Followed:
+    """What the tests of the copy say."""
     (project / GOLDEN).unlink()
     # Without what this run was told, such as which of several processes it is.
     own = {name: value for name, value in os.environ.items() if not name.startswith("PYTEST_")}
@@ -97,14 +103,21 @@ def followed(tmp_path_factory: pytest.TempPathFactory) -> Followed:
     return Followed(project, Counter(modules))
 
 
+def test_every_recipe_still_fits_the_code(project: Path) -> None:
+    assert len([path for path in project.rglob("*.py") if compile(path.read_bytes(), path, "exec")])
+
+
+@pytest.mark.slow
 def test_the_reader_of_the_recipe_keeps_the_contract(followed):
     assert followed.passed["contract"] >= 10
 
 
+@pytest.mark.slow
 def test_the_expert_of_the_recipe_keeps_the_contract(followed):
     assert followed.passed["expert"] >= 20
 
 
+@pytest.mark.slow
 def test_the_pooling_of_the_recipe_changes_no_other(followed):
     assert followed.passed["golden_features"] + followed.passed["pooling"] >= 5
     before = json.loads((ROOT / GOLDEN).read_text(encoding="utf-8"))["features"]

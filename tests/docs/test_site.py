@@ -9,9 +9,6 @@ import pytest
 
 pytestmark = pytest.mark.extra
 DESKTOP, PHONE = (1280, 900), (390, 844)
-SIDEWAYS = """[...document.querySelectorAll('figure.drawing')]
-    .filter(figure => figure.scrollWidth > figure.clientWidth).map(figure => figure.outerHTML)"""
-"""The figures that a reader has to push sideways to see whole."""
 PAGES = ("index", "params", "data/errors")
 MORE = ("concepts", "store", "reference/store")
 
@@ -106,34 +103,3 @@ def test_a_page_loads_alone_and_fits_every_screen(site, reader, name):
     for size in (DESKTOP, PHONE):
         visitor.page.set_viewport_size({"width": size[0], "height": size[1]})
         assert width(visitor) <= size[0], f"{width(visitor)} px wide"
-
-
-@pytest.mark.parametrize(
-    ("size", "scheme", "shown"),
-    [(DESKTOP, "light", "default"), (PHONE, "dark", "slate")],
-    ids=["desktop", "phone"],
-)
-def test_page_and_figures_take_the_colours_of_the_system(site, reader, size, scheme, shown):
-    viewport = {"width": size[0], "height": size[1]}
-    visitor = reader(viewport=viewport, color_scheme=scheme)
-    page = visitor.page
-    open_page(visitor, site / "concepts.html")
-    assert page.evaluate("document.body.getAttribute('data-md-color-scheme')") == shown
-    assert width(visitor) <= size[0]
-    assert page.locator("figure.drawing svg").count() >= 6
-    assert page.evaluate(SIDEWAYS) == []
-    text = page.locator("figure.drawing svg text").first
-    colour = {"default": "rgb(31, 35, 40)", "slate": "rgb(230, 233, 238)"}[shown]
-    assert text.evaluate("node => getComputedStyle(node).fill") == colour
-
-
-def test_search_finds_a_parameter_without_a_server(site, reader):
-    page = reader(viewport={"width": 1280, "height": 900}).page
-    page.goto((site / "index.html").as_uri())
-    page.locator("input.md-search__input").click()
-    page.keyboard.type("feature_lag")
-    found = page.locator(".md-search-result__link").first
-    found.wait_for(timeout=20_000)
-    assert "concepts.html" in "".join(
-        link.get_attribute("href") or "" for link in page.locator(".md-search-result__link").all()
-    )

@@ -1,9 +1,7 @@
 """A stream that decides the action must be missed, and one that decides nothing must not."""
 
-import csv
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -19,13 +17,10 @@ from pipeline.evaluate.ablation import (
 )
 from pipeline.evaluate.baselines import Baselines
 from pipeline.evaluate.figures import rivalry
-from pipeline.evaluate.tables import ablation_table, ablation_text, write_tables
 from pipeline.policy.checkpoint import PolicyCheckpoint
 from pipeline.policy.normalization import ChannelStatistics, Normalization
 from pipeline.policy.policy import Policy
 from pipeline.store import FeatureStore
-from pipeline.train.batches import Lags
-from pipeline.train.predictions import Predictions
 from pipeline.train.run import policy_shape
 from pipeline.train.split import split_by_episode
 from pipeline.train.training_data import source_of, split_parts
@@ -133,23 +128,6 @@ def test_the_ways_to_spoil_are_those_that_mean_something(study: AblationStudy) -
     assert all(one.comparison.ticks == study.intact.ticks for one in study.ablated)
 
 
-def test_the_figures_are_the_same_in_table_and_files(study, trained_store, tmp_path):
-    multiple = times(study, "sensor", "zeroed")
-    ticks = np.arange(4)
-    predictions = Predictions(ticks, ticks * 0, *[np.zeros((4, 1, 5), np.float32)] * 2, ticks > 0)
-    parts: dict[str, Any] = {"comparison": study.intact, "predictions": predictions}
-    evaluation: Any = SimpleNamespace(**parts, store=trained_store, study=study, energy=None)
-    write_tables(tmp_path, evaluation)
-    streams = list(csv.DictReader((tmp_path / "streams.csv").read_text().splitlines()))
-    (row,) = [r for r in streams if r["spoilt"] == "sensor zeroed"]
-    assert float(row["times_intact"]) == pytest.approx(multiple, rel=1e-5)
-    assert float(row["times_intact_low"]) < multiple < float(row["times_intact_high"])
-    rows = ablation_table(study).rows
-    assert [row[:2] for row in rows[:2]] == [["all", "intact"], ["sensor", "zeroed"]]
-    assert len(rows) == 2 + len(study.ablated) and rows[-1][0] == "none"
-    assert ablation_text(study).splitlines()[-len(study.notes) :] == list(study.notes)
-
-
 def test_the_first_ticks_of_an_episode_are_not_judged(tiny_store, tmp_path):
     """A delay would find nothing there."""
     store = FeatureStore.open(tiny_store(tmp_path, reuse=1))
@@ -179,13 +157,6 @@ def test_an_alteration_leaves_the_batch_and_the_other_streams_alone(store: Featu
     assert torch.equal(at_mean.sensor, torch.tensor(mean).float().expand(4, 3, 5))
     assert torch.equal(batch.sensor, before)
     assert at_mean.features is batch.features and at_mean.action is batch.action
-
-
-def test_features_go_back_whole_rows(tiny_store: Make, tmp_path: Path) -> None:
-    store = FeatureStore.open(tiny_store(tmp_path, reuse=1))
-    lags = {"delayed 100 ms": Lags(features=1), "delayed 200 ms": Lags(features=2)}
-    assert delays(store, "features") == lags
-    assert delays(store, "state")["delayed 50 ms"] == Lags(state_s=0.05)
 
 
 @pytest.mark.parametrize(("ticks", "how"), [(2, "delayed 330 ms"), (1, "delayed inf ms")])

@@ -19,7 +19,6 @@ from pipeline.evaluate.experiments import (
     experiment_table,
     read_experiments,
 )
-from pipeline.evaluate.figures import Figure
 from pipeline.evaluate.tables import GROUPS
 
 Written = Callable[..., Path]
@@ -174,29 +173,3 @@ def test_what_was_judged_on_other_ticks_is_refused(written: Written) -> None:
     written("few-fold2", HARD[3:8], recipe="few", first=3)
     with pytest.raises(ConfigError, match="same test ticks"):
         read_experiments(reports)
-
-
-def test_one_group_has_no_interval(written: Written) -> None:
-    written("a", HARD[:1])
-    reports = written("b", HARD[:1] + 0.1)
-    a, b = read_experiments(reports)
-    assert b.minus(a, "executed") == Figure(pytest.approx(0.1))
-    table = experiment_table([a, b], "executed")
-    assert table.rows[1][2] == "+0.100"
-
-
-def test_the_neighbour_in_other_features_is_another(written: Written) -> None:
-    reports = written("a", HARD)
-    written("b", HARD)
-    lines = (reports / "b" / GROUPS).read_text().splitlines()
-    place = lines[0].split(",").index("nearest_neighbour_executed")
-    rows = [line.split(",") for line in lines]
-    for row in rows[1:]:
-        row[place] = "0.1"
-    (reports / "b" / GROUPS).write_text("\n".join(map(",".join, rows)))
-    a, b = read_experiments(reports)
-    assert (a.best_baseline("executed"), b.best_baseline("executed")) == (
-        "zero_action",
-        "nearest_neighbour",
-    )
-    assert experiment_table([a, b], "executed").rows[-1][1].startswith("0.100")

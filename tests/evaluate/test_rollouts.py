@@ -94,23 +94,6 @@ def test_an_episode_is_the_same_alone_as_among_others() -> None:
     np.testing.assert_allclose(there.trace.offset_mm, here.trace.offset_mm, atol=1e-3)
 
 
-def test_real_time_chunking_gives_the_policy_what_is_left_of_its_plan(monkeypatch):
-    parts = made("flow_matching")
-    act, guides, chunks = parts[1].act, [], []
-
-    def watched(observation: Any, generators: Any, guide: Any) -> torch.Tensor:
-        guides.append(guide)
-        chunks.append(act(observation, generators, guide))
-        return chunks[-1]
-
-    monkeypatch.setattr(parts[1], "act", watched)
-    rolled(parts, chunking="rtc", execute=2, ablations=(), episodes=1)
-    assert guides[0] is None and len(guides) > 3
-    for guide, before in zip(guides[1:], chunks, strict=False):
-        torch.testing.assert_close(guide.chunk[:, :2], before[:, 2:])
-        assert (guide.weight[:, :2] > 0).all() and not guide.weight[:, 2:].any()
-
-
 def test_robots_share_a_pass_of_the_model_and_are_told_the_task() -> None:
     parts = made()
     fresh = rolled(parts, ablations=())

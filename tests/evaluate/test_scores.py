@@ -1,6 +1,5 @@
 """Errors and baselines against values worked out by hand."""
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -12,9 +11,6 @@ from pipeline.evaluate.baselines import BASELINES
 from pipeline.evaluate.figures import rivalry
 from pipeline.train.predictions import Predictions
 from pipeline.train.scores import ActionGroup, Comparison, compare
-
-Recorded = Callable[..., Predictions]
-Compared = Callable[[Predictions], Comparison]
 
 
 def test_errors_worked_out_by_hand() -> None:
@@ -91,20 +87,3 @@ def test_what_hardly_moves_beside_its_like_is_told_and_can_be_left_out(recorded,
     moving = found.without_low_variance()
     assert moving.overall("policy") == pytest.approx((0.3 + 1 / 10.1) / 4, rel=1e-4)
     assert moving.varying() == [0, 1, 2, 4] and found.varying() == [0, 1, 2, 3, 4]
-
-
-@pytest.mark.parametrize(
-    ("changed", "still"),
-    [
-        ({}, {3, 4}),
-        ({"names": ("kHip", "kKnee", "kAnkle", "kElbow", "kWrist")}, {3, 4}),
-        ({"units": ("mm", "mm", "mm", "rad", "rad")}, set()),
-        ({"scale": np.array([0.0, 0.0, 0.0, 1.0, 0.001])}, set()),
-    ],
-)
-def test_only_what_has_its_like_may_be_still(recorded, compared, changed, still):
-    """Joints that are called after limbs are alike by their unit."""
-    comparison = compared(recorded(np.arange(60)))
-    assert comparison.low_variance() == {}
-    changed_joints = replace(joints(comparison, [1.0, 1.0, 1.0, 0.001, 0.001]), **changed)
-    assert changed_joints.low_variance().keys() == still

@@ -4,7 +4,6 @@ import csv
 import json
 import re
 from collections.abc import Callable
-from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -12,7 +11,7 @@ import numpy as np
 import pytest
 
 from pipeline.evaluate.baselines import BASELINES, METHODS
-from pipeline.evaluate.figures import NO_INTERVAL, Figure, rivalry
+from pipeline.evaluate.figures import NO_INTERVAL, Figure
 from pipeline.evaluate.tables import error_table, error_text, metrics, write_tables
 from pipeline.store import FeatureStore
 from pipeline.train.predictions import Predictions
@@ -63,14 +62,6 @@ def test_the_metrics_are_numbers_only_the_executed_first(comparison: Comparison)
     assert all(np.isfinite(numbers(document)))
 
 
-def test_several_executed_steps_have_the_first_beside_them(comparison: Comparison) -> None:
-    several = replace(comparison, execute=3)
-    document = metrics(several)
-    assert list(document) == ["test", "executed", "first_step", "chunk"]
-    assert document["first_step"] == metrics(comparison)["executed"]
-    assert "first step" in error_text(several).splitlines()[-1]
-
-
 def test_samples_and_phases_are_there_where_they_are_known(predictions, comparison):
     phases = np.where(TICKS < 60, "approach", "hold")
     others = {
@@ -99,20 +90,6 @@ def test_of_one_group_it_is_said_that_there_is_no_interval(recorded, compared):
     assert NO_INTERVAL in text and text.endswith(
         " five folds test each recording once (docs/training.md)"
     )
-
-
-def test_dimensions_that_hardly_move_are_said_below_the_table(comparison: Comparison) -> None:
-    """Without them it may be that a baseline wins; `metrics.json` stays as it is."""
-    names = tuple(f"joint_{index}" for index in range(5))
-    scale = np.array([0.05, 0.06, 0.07, 1e-9, 0.0])
-    still = replace(comparison, names=names, units=("",) * 5, scale=scale)
-    moving = replace(still, scale=np.array([0.05, 0.06, 0.07, 0.0, 0.0]))
-    *_, line = error_text(still).splitlines()
-    assert line.startswith("hardly moving: joint_3 ") and "1 of the 4 dimensions" in line
-    assert f"{moving.overall('policy'):.3f}, {rivalry(moving).ratio:.2f} times the best" in line
-    overall = metrics(still)["chunk"]["overall"]["policy"]["value"]
-    assert overall == pytest.approx(still.overall("policy"), rel=1e-5)
-    assert moving.overall("policy") < 0.01 * still.overall("policy")
 
 
 def test_files_hold_every_dimension_step_episode_and_tick(comparison, predictions, store, tmp_path):
@@ -151,10 +128,3 @@ def test_files_hold_every_dimension_step_episode_and_tick(comparison, prediction
     assert tick["episode"] == "episode_002"
     assert float(tick["time_s"]) == pytest.approx(0.1)
     assert float(tick["dx_predicted"]) - float(tick["dx_recorded"]) == pytest.approx(0.1, abs=1e-5)
-
-
-def test_a_step_no_chunk_reaches_is_empty(recorded, compared, store, tmp_path):
-    predictions = recorded(np.array([28, 58]))
-    write_tables(tmp_path, judged(compared(predictions), predictions, store))
-    lines = (tmp_path / "steps.csv").read_text().splitlines()
-    assert lines[3:] == [f"2{',' * 18}", f"3{',' * 18}"] and ",," not in lines[2]

@@ -166,28 +166,6 @@ def test_a_feature_that_is_not_finite_names_row_and_variant_and_spares_the_other
     assert [one.row for one in next(encoded)[0]] == [0]
 
 
-@pytest.mark.parametrize("variants", [1, K])
-def test_auto_settles_where_more_rows_gain_nothing(variants):
-    """A second a row and one a batch: twice the rows gain less and less, past 32 below 3 %."""
-    vlm = FakeVLM(overhead_s=1.0 * variants)
-    encoder = encoder_of(vlm, "auto", variants)
-    rows = (ready(row, [row % 200] * variants) for row in range(600))
-    found = sorted(one.row for batch, _ in encoder.encoded(rows) for one in batch)
-    assert found == list(range(600))
-    assert encoder.size.settled
-    assert encoder.size.current == 32 * variants if variants == 1 else encoder.size.current == 64
-    assert vlm.batches[0] == 8 // variants * variants
-    assert max(vlm.batches) == 64 // variants * variants
-
-
-def test_auto_takes_what_memory_allows():
-    vlm = FakeVLM(room=20, overhead_s=100.0)
-    encoder = encoder_of(vlm, "auto", 1)
-    assert sum(len(batch) for batch, _ in encoder.encoded(ready(i, [1]) for i in range(300))) == 300
-    assert encoder.size.settled
-    assert encoder.size.current == 16
-
-
 def test_a_batch_that_is_not_full_says_nothing_about_its_size():
     encoder = encoder_of(FakeVLM(overhead_s=100.0), "auto", 1)
     for _ in range(9):

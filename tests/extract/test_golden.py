@@ -113,13 +113,6 @@ class TestStoreBefore:
         assert_golden(params)
         assert contents(params.extract.store / GOLDEN) == before
 
-    def test_the_bytes_are_those_of_a_fresh_build(self, params, changed, extracted, tmp_path):
-        other = changed(extract={"store": str(tmp_path / "o.zarr"), "sensor_dtype": "float16"})
-        extract(other, quiet)
-        carried = changed(extract={"sensor_dtype": "float16"})
-        extract(carried, quiet)
-        assert contents(carried.extract.store / GOLDEN) == contents(other.extract.store / GOLDEN)
-
 
 class TestKills:
     @pytest.mark.parametrize("frames", [3, 8])

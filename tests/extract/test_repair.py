@@ -2,7 +2,6 @@
 
 import json
 import shutil
-from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,11 +11,8 @@ import numpy as np
 import pytest
 
 from pipeline.base.config import Params
-from pipeline.base.digests import ContentDigests, ledger_path
 from pipeline.base.errors import StoreIncomplete, StoreMismatch
 from pipeline.extract import ExtractionReport, extract
-from pipeline.extract.build_state import row_sources
-from pipeline.extract.survey import survey
 from pipeline.store import FeatureStore, StoreBuild, part_path
 from pipeline.store.schema import chunk_paths, read_spec
 from pipeline.store.verification import verify
@@ -140,18 +136,6 @@ def test_arrays_of_other_lengths_are_found_and_mended(case):
     assert any("metadata were changed" in issue for issue in verify(case.store).issues)
     case.mended()
     assert contents(case.store) == contents(case.original)
-
-
-def test_workers_may_take_rows_of_a_damaged_store(case, monkeypatch):
-    """They name it by its absolute path, wherever params are relative."""
-    case.flip("vl/key", 40)
-    store = case.store
-    monkeypatch.chdir(store.parent)
-    case.document["extract"] = case.document["extract"] | {"store": store.name}
-    with closing(ContentDigests.to_read(ledger_path(store))) as digests:
-        surveyed = survey(case.params, digests)
-    (source,) = row_sources([store], surveyed)
-    assert source.rows == {}
 
 
 def test_other_params_repair_nothing(case):

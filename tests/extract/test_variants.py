@@ -9,7 +9,7 @@ import pytest
 from pipeline.base.config import Params
 from pipeline.base.errors import DiskFull
 from pipeline.base.text import size
-from pipeline.store import FeatureStore, StoreBuild
+from pipeline.store import FeatureStore
 from pipeline.store.schema import ARRAY_NAMES
 from tests.extract.conftest import run
 
@@ -104,28 +104,6 @@ class TestWhatItTakesOver:
         _, said = run(changed(vlm={"variants": 2}, extract={"plan": True}))
         assert any("feature spec, variants: null -> 2" in line for line in said)
         assert any("rows: 24, 0 known, 24 to compute in 2 variants" in line for line in said)
-
-    def test_an_interrupted_build_goes_on(self, extracted, varied, monkeypatch):
-        params = varied(extract={"batch_size": 2 * K})
-        real = StoreBuild.mark
-        commits = []
-
-        def mark(self, numbers, *rest):
-            real(self, numbers, *rest)
-            commits.append(len(numbers))
-            if len(commits) == 3:
-                raise KeyboardInterrupt
-
-        with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
-            patch.setattr(StoreBuild, "mark", mark)
-            run(params)
-        assert commits == [2, 2, 2], "the batch size counts variants"
-        report, said = run(params)
-        assert report.computed == 24 - 6
-        assert any("rows: 24, 6 known, 18 to compute in 3 variants each" in line for line in said)
-        found, undisturbed = FeatureStore.open(params.extract.store), extracted[K]
-        assert np.array_equal(found.array("vl/key"), undisturbed.array("vl/key"))
-        assert np.allclose(found.array("vl/features"), undisturbed.array("vl/features"), atol=2e-5)
 
 
 def test_the_plan_and_the_disk_check_count_every_variant(extracted, varied, monkeypatch):

@@ -125,20 +125,3 @@ def test_a_full_disk_while_the_robot_moves(small_disk: Path) -> None:
         opened(small_disk)
     ballast.unlink()
     assert 0 < check_prefix(opened(recover(recorder.part))) <= ticks
-
-
-def test_a_disk_that_is_full_when_the_run_ends(small_disk: Path) -> None:
-    recorder = RunRecorder(small_disk, METADATA, "Push")
-    for tick in range(60):
-        record(recorder, tick)
-    recorder._queue.put(None)
-    recorder._thread.join()
-    assert recorder.failed is None
-    ballast = small_disk / "ballast"
-    with ballast.open("wb", buffering=0) as file, pytest.raises(OSError, match="No space"):
-        while True:
-            file.write(bytes(2**12))
-    with pytest.raises(DiskFull, match="Make room, then finish it"):
-        recover(recorder.part)
-    ballast.unlink()
-    assert check_prefix(opened(recover(recorder.part))) == 60

@@ -16,8 +16,7 @@ import yaml
 
 from stages.command import run
 from tests.fuzz import oracle
-from tests.fuzz.corpus import ARCHIVE, HEAD, REAL, RECORDINGS, STORE, params
-from tests.fuzz.hostile import CANARY, HOSTILE
+from tests.fuzz.corpus import ARCHIVE, HEAD, RECORDINGS, STORE, params
 from tests.fuzz.mutations import Change, change_any
 
 ROOT = Path(__file__).parents[2]
@@ -33,24 +32,23 @@ class Subject:
     """Its class in the table."""
     place: str
     """Where it lies in a case's folder, as in the corpus."""
-    stages: tuple[str, ...] = ("extract",)
-    """What reads it: each as often as it stands here."""
+    stage: str = "extract"
+    """What reads it."""
     sets: dict[str, str] = field(default_factory=dict)
     """What its command is told, where {} is its place, and {corpus} that of the corpus."""
 
 
 _HEAD = {"evaluate.checkpoint": "{}", "evaluate.store": f"{{corpus}}/{STORE}"}
 SUBJECTS = {
-    **{n: Subject("recordings", n, ("read",) * 3 + ("extract",)) for n in (*RECORDINGS, *REAL)},
+    **{name: Subject("recordings", name, "read") for name in RECORDINGS},
     "vlm": Subject("VLM folders", "vlm", sets={"vlm.checkpoint": "{}"}),
     "adapter": Subject("adapters", "adapter", sets={"vlm.adapter": "{}"}),
-    "store": Subject("stores", STORE, ("verify", "verify", "train_head")),
-    "archive": Subject("archives", ARCHIVE, ("archive",), {"archive.restore": "true"}),
-    "head": Subject("trained heads", HEAD, ("load",) * 3 + ("evaluate",), _HEAD),
+    "store": Subject("stores", STORE, "verify"),
+    "archive": Subject("archives", ARCHIVE, "archive", {"archive.restore": "true"}),
+    "head": Subject("trained heads", HEAD, "load", _HEAD),
 }
-TURN = (["recordings"] * 9 + ["VLM folders"] * 2 + ["adapters"] * 2 + ["stores"] * 3) + (
-    ["archives"] + ["trained heads"] * 2 + ["hostile"] * 3
-)
+TURN = ["recordings"] * 9 + ["VLM folders"] * 2 + ["adapters"] * 2 + ["stores"] * 3
+TURN += ["archives"] + ["trained heads"] * 2
 """The classes of the cases, over and over."""
 CLASSES = tuple(dict.fromkeys(TURN))
 
@@ -62,8 +60,8 @@ class Case:
     seed: int
     number: int
     corpus: Path
-    whole: tuple[str, str] | None = None
-    """The thing and the stage of a case in which nothing is changed."""
+    whole: str = ""
+    """The thing of a case in which nothing is changed."""
     seconds: float = 10.0
     """Of processor time that it may take; and six times as long by the clock."""
 
@@ -77,33 +75,22 @@ class Case:
         """The class of the table."""
         return TURN[self.number % len(TURN)]
 
-    @property
-    def turn(self) -> int:
-        """How many cases of its class come before it."""
-        rounds, place = divmod(self.number, len(TURN))
-        return rounds * TURN.count(self.kind) + TURN[:place].count(self.kind)
-
     @cached_property
     def thing(self) -> str:
-        """The name of what is changed; hostile changes come each in its turn."""
+        """The name of what is changed."""
         if self.whole:
-            return self.whole[0]
-        if self.kind == "hostile":
-            return HOSTILE[self.turn % len(HOSTILE)][0]
-        names = [n for n, s in SUBJECTS.items() if s.kind == self.kind and n not in REAL]
-        real = [name for name in REAL if (self.corpus / name).exists()]
-        return self.rng.choice(names + real * (self.kind == "recordings"))
+            return self.whole
+        return self.rng.choice([name for name, s in SUBJECTS.items() if s.kind == self.kind])
 
     @property
     def subject(self) -> Subject:
         """What is changed."""
         return SUBJECTS[self.thing]
 
-    @cached_property
+    @property
     def stage(self) -> str:
         """What reads it."""
-        drawn = Random(f"{self.seed}-{self.number}-stage")
-        return self.whole[1] if self.whole else drawn.choice(self.subject.stages)
+        return self.subject.stage
 
     @property
     def folder(self) -> Path:
@@ -118,8 +105,7 @@ class Case:
     @property
     def baseline(self) -> Path:
         """Where the result is kept that the thing gives as it is in the corpus."""
-        stage = "read" if self.subject.kind == "recordings" else self.stage
-        return self.corpus / f"{self.thing}-{stage}.baseline"
+        return self.corpus / f"{self.thing}.baseline"
 
     @property
     def arguments(self) -> list[str]:
@@ -146,14 +132,6 @@ class Case:
             shutil.copytree(source, self.place, copy_function=os.link)
         if self.whole:
             return Change("nothing", self.place, "same")
-        if self.kind == "hostile":
-            _, pattern, what, act, *permitted = HOSTILE[self.turn % len(HOSTILE)]
-            paths = sorted(path for path in self.folder.rglob(pattern) if path.is_file())
-            path = self.rng.choice(paths)
-            act(path)
-            permits = permitted[0] if permitted else "refuse"
-            sound = self.subject.kind != "recordings" and what != "a terabyte"
-            return Change(what, path, permits, sound=sound or bool(permitted))
         return change_any(self.rng, self.place, self.corpus / "other" / self.subject.place)
 
     def run(self) -> int:
@@ -165,8 +143,6 @@ class Case:
 
     def judge(self, change: Change) -> str:
         """After exit 0: what is not as the files have it; empty where all is right."""
-        if (self.folder / CANARY).exists():
-            return "code of the file was executed"
         try:
             return oracle.judge(self, change)
         except Exception as error:
@@ -174,12 +150,5 @@ class Case:
 
 
 def wholes(corpus: Path) -> list[Case]:
-    """Every thing of a corpus as it is, with every stage whose result is kept."""
-    pairs = [
-        (name, stage)
-        for name, subject in SUBJECTS.items()
-        if (corpus / subject.place).exists()
-        for stage in dict.fromkeys(subject.stages)
-        if subject.kind != "recordings" or stage == "read"
-    ]
-    return [Case(-1, number, corpus, pair) for number, pair in enumerate(pairs)]
+    """Every thing of a corpus as it is."""
+    return [Case(-1, number, corpus, name) for number, name in enumerate(SUBJECTS)]

@@ -3,7 +3,6 @@
 `other/` holds a second recording of each format, to take files from that belong elsewhere.
 """
 
-import shutil
 from pathlib import Path
 from typing import Any
 
@@ -18,18 +17,14 @@ from stages.command import run
 from tests.data.conftest import START, Truth, write_lerobot, write_new, write_old, write_raw
 
 TASK = "Touch_the_dot"
-REAL = ("real_raw", "real_new", "real_old")
-"""Of the recorder itself, where they are at hand."""
 RECORDINGS = ("raw", "new", "old", "lerobot_v21", "lerobot_v30", "lerobot_images")
 BEGIN = 1762581311.75
 """A quarter of a second before a clock of float32 goes 128 s on."""
 STORE, ARCHIVE, HEAD = "store.zarr", "archive.zarr", "head"
 
 
-def write_corpus(root: Path, real: Path | None) -> None:
+def write_corpus(root: Path) -> None:
     """Recordings, a checkpoint, an adapter, a store, its archive and a head."""
-    for name in REAL if real else ():
-        shutil.copytree(real / "insertion" / name.removeprefix("real_"), root / name)
     write_recordings(root, seed=0)
     write_recordings(root / "other", seed=1)
     write_model(root)

@@ -3,24 +3,13 @@
 Every change draws from the generator that it is given, so that a case is known by its number.
 """
 
-import csv
-import io
 import json
 import os
-import pickle
-import re
-import struct
-import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from random import Random
 from typing import Any, Literal, NamedTuple
-
-import numpy as np
-import pyarrow as pa
-import pyarrow.parquet as pq
-from PIL import Image
 
 Permit = Literal["same", "any", "type", "refuse"]
 """What exit 0 may give after a change. `same`: what it gave before. `any`: what stands there now.
@@ -141,191 +130,6 @@ def edit_lines(rng: Random, data: bytes) -> Edited:
     return edited._replace(data=b"\n".join(lines) + b"\n")
 
 
-def edit_safetensors(rng: Random, data: bytes) -> Edited:
-    """A wrong value in the header."""
-    length = struct.unpack("<Q", data[:8])[0]
-    edited = edit_document(rng, data[8 : 8 + length])
-    header = struct.pack("<Q", len(edited.data)) + edited.data
-    return edited._replace(data=header + data[8 + length :], what=f"header: {edited.what}")
-
-
-# --- tables and arrays ---------------------------------------------------------------------------
-
-CELLS = ("", " ", "nan", "inf", "1e999", "abc", "1_0", "0x10", "9" * 400, "١٢", '"', "1;2", "-0")
-
-
-def edit_csv(rng: Random, data: bytes) -> Edited:
-    """A wrong cell, or a column or line too many or too few."""
-    rows = list(csv.reader(io.StringIO(data.decode())))
-    line, column = rng.randrange(1, len(rows)), rng.randrange(len(rows[0]))
-    what = f"line {line + 1}, column {rows[0][column]}: "
-    match rng.choice(["cell"] * 5 + ["no column", "no line", "order", "cut"]):
-        case "cell":
-            rows[line][column] = rng.choice([*CELLS, "x" * 200_000])
-            what += f"the cell is {rows[line][column][:20]!r}"
-        case "no column":
-            rows = [row[:column] + row[column + 1 :] for row in rows]
-            what += "no such column"
-        case "no line":
-            del rows[line]
-            what += "no such line"
-        case "order":
-            rows.insert(1, rows.pop(line))
-            what += "the line comes first"
-        case _:
-            del rows[line][column:]
-            what += "the line is cut off"
-    return Edited("".join(",".join(row) + "\n" for row in rows).encode(), what)
-
-
-def _last(array: np.ndarray, value: object) -> np.ndarray:
-    changed = array.copy()
-    changed.reshape(-1)[-1] = value
-    return changed
-
-
-_TYPES = ["c8", "U8", "S8", "?", "M8[s]", "O", "f2", "i8", "u1", "g", ">f8", "f4"]
-ARRAYS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
-    "no row": lambda a: a[:0],
-    "a row less": lambda a: a[:-1],
-    "a single number": lambda a: a.reshape(-1)[0],
-    "an axis more": lambda a: a[None],
-    "transposed": lambda a: a.T,
-    "flat": lambda a: a.reshape(-1),
-    "backwards": lambda a: a[::-1],
-    "NaN": lambda a: _last(a, np.nan),
-    "infinity": lambda a: _last(a, np.inf),
-    "1e300": lambda a: _last(a.astype(np.float64), 1e300),
-    "records": lambda a: np.zeros(len(a), [("a", "f4"), ("b", "i4")]),
-    "Fortran's order": np.asfortranarray,
-} | {f"of {t}": lambda a, t=t: a.astype(t) for t in _TYPES}
-
-
-def _other_array(rng: Random, array: np.ndarray) -> tuple[np.ndarray, str]:
-    name = rng.choice(list(ARRAYS))
-    with warnings.catch_warnings(), np.errstate(all="ignore"):
-        warnings.simplefilter("ignore")
-        try:
-            return ARRAYS[name](array), f"is {name}"
-        except (ValueError, TypeError):  # words are no numbers
-            return np.zeros(3), "is three zeros"
-
-
-def edit_npz(rng: Random, data: bytes) -> Edited:
-    """A member of another shape, type or content, or one too many or too few."""
-    with np.load(io.BytesIO(data)) as archive:
-        members = dict(archive)
-    name, permits, buffer = rng.choice(list(members)), "any", io.BytesIO()
-    match rng.choice(["array"] * 6 + ["drop", "more"]):
-        case "array":
-            members[name], what = _other_array(rng, members[name])
-        case "drop":
-            del members[name]
-            what = "is dropped"
-        case _:
-            members["nobody_knows"], permits = np.array([{}], object), "same"
-            what = "has an unknown neighbour of objects"
-    np.savez(buffer, **members)
-    return Edited(buffer.getvalue(), f"member {name!r} {what}", permits, name)
-
-
-def edit_pickle(rng: Random, data: bytes) -> Edited:
-    """Another value at a place of a pickled document, or another protocol."""
-    document: Any = pickle.loads(data)
-    parent, key, where = _place(rng, document)
-    while isinstance(parent, list) and rng.random() < 0.7:  # most places are paths of frames
-        parent, key, where = _place(rng, document)
-    protocol, permits = rng.randrange(6), "any"
-    what = f"and all in protocol {protocol}"
-    act = rng.choice(["value"] * 6 + ["protocol", "drop"])
-    if act == "drop":
-        del parent[key]
-        what = "is dropped"
-    elif act == "protocol":
-        permits = "same"
-    elif isinstance(parent[key], np.ndarray):
-        parent[key], what = _other_array(rng, parent[key])
-    else:  # no number of thousands of digits, and nothing nested deeper than a pickler goes
-        name = rng.choice([name for name in VALUES if not re.search("00 deep|5000", name)])
-        permits, what = _permits(parent[key], VALUES[name]), f"is {name}"
-        parent[key] = json.loads(VALUES[name])
-    return Edited(pickle.dumps(document, protocol), f"{where} {what}", permits, where)
-
-
-CONSTANTS = (None, True, -1, 10**12, 0.5, 1e300, float("nan"), float("inf"), "", "7")
-CONSTANTS += ("../../../etc/passwd", "a\0b", b"\xff\xfe", [[1.0]], [], {"a": 1})
-"""What a column of a table may hold, everywhere or in its last row."""
-
-
-def edit_parquet(rng: Random, data: bytes) -> Edited:
-    """A column of other types or values, rows too many or too few, a footer that lies."""
-    table: pa.Table = pq.read_table(io.BytesIO(data))
-    names = table.column_names
-    name = rng.choice([name for name in names if not name.startswith("stats/")])
-    rows, wrong = table[name].to_pylist(), rng.choice(CONSTANTS)
-    images = ["image"] * 20 * isinstance(table[name].type, pa.StructType)
-    match rng.choice(
-        images + ["all"] * 4 + ["last"] * 3 + ["drop", "twin", "rows", "row", "order"]
-    ):
-        case "image":
-            edited = edit_image(rng, rows[-1]["bytes"])
-            table = with_column(table, name, [*rows[:-1], rows[-1] | {"bytes": edited.data}])
-            what = f"the last image of {name!r} {edited.what}"
-        case "all":
-            table = with_column(table, name, [wrong] * len(rows))
-            what = f"column {name!r} is of {wrong!r}"
-        case "last":
-            if isinstance(rows[-1], list):
-                wrong = rng.choice([[wrong] * len(rows[-1]), rows[-1] * 2])
-            table = with_column(table, name, [*rows[:-1], wrong])
-            what = f"column {name!r} ends with {wrong!r:.99}"
-        case "drop":
-            table, what = table.drop_columns([name]), f"column {name!r} is dropped"
-        case "twin":
-            table = pa.Table.from_arrays([*table.columns, table[name]], names=[*names, name])
-            what = f"column {name!r} is there twice"
-        case "rows":
-            table, what = pa.concat_tables([table, table]), "all rows are there twice"
-        case "row":
-            table, what = table.slice(1), "the first row is dropped"
-        case _:
-            table, what = table.take(list(range(len(rows)))[::-1]), "rows are backwards"
-    buffer = io.BytesIO()
-    pq.write_table(table, buffer)
-    return Edited(buffer.getvalue(), what, key=name)
-
-
-def with_column(table: pa.Table, name: str, rows: list[Any]) -> pa.Table:
-    try:
-        column = pa.array(rows)
-    except (pa.ArrowException, TypeError):
-        column = pa.array([str(row) for row in rows])
-    return table.set_column(table.column_names.index(name), name, column)
-
-
-IMAGES = ("GIF", "BMP", "TIFF", "WEBP", "PDF", "PNG", "JPEG")
-
-
-def edit_image(rng: Random, data: bytes) -> Edited:
-    """Another size in a JPEG's header, or an image of another format or mode."""
-    kind = rng.choice(["size", *IMAGES, "L", "CMYK"])
-    if kind == "size" and data.startswith(b"\xff\xd8"):
-        size = rng.choice([(0, 0), (65500, 65500), (12500, 12500), (1, 1)])
-        return Edited(resized(data, *size), f"says to have {size} pixels")
-    picture, buffer = Image.open(io.BytesIO(data)).convert("RGB"), io.BytesIO()
-    if kind in IMAGES:
-        picture.save(buffer, kind)
-    else:
-        picture.convert("RGB" if kind == "size" else kind).save(buffer, "JPEG")
-    return Edited(buffer.getvalue(), f"is {kind}")
-
-
-def resized(data: bytes, height: int, width: int) -> bytes:
-    """A JPEG whose header says another size."""
-    at = data.index(b"\xff\xc0") + 5
-    return data[:at] + struct.pack(">HH", height, width) + data[at + 4 :]
-
-
 # --- bytes of any file ---------------------------------------------------------------------------
 
 
@@ -390,12 +194,6 @@ def change_file(rng: Random, path: Path, others: list[Path]) -> Change:
 KINDS: dict[str, Callable[[Random, bytes], Edited]] = {
     ".json": edit_document,
     ".jsonl": edit_lines,
-    ".csv": edit_csv,
-    ".npz": edit_npz,
-    ".pkl": edit_pickle,
-    ".parquet": edit_parquet,
-    ".safetensors": edit_safetensors,
-    ".jpg": edit_image,
 }
 
 

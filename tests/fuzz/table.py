@@ -8,8 +8,8 @@ How it works:
    checkpoint, an adapter, a store, its archive and a head.
 2. cases.py chooses, by the seed and the case's number alone: a thing, what is done to it, and the
    command that reads it. The thing is laid into a folder of its own, in hard links.
-3. mutations.py has what chance does to a file, by the kind of file; hostile.py, what somebody would
-   write on purpose. Each change says what may come of it where the command ends with 0.
+3. mutations.py has what may be done to a file, by the kind of file. Each change says what may come
+   of it where the command ends with 0.
 4. runner.py forks a process for each case from one that has imported everything, and limits it to
    10 s and 2 GiB.
 5. oracle.py judges. After exit 0, what was read must be as before where the change permits nothing
@@ -47,11 +47,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--case", type=int, help="run this one alone")
     parser.add_argument("--jobs", type=int, default=min(2, os.cpu_count() or 1))
     parser.add_argument("--corpus", type=Path, help="where it is, or is to be made and kept")
-    parser.add_argument("--real", type=Path, help="where real recordings are")
     options = parser.parse_args(arguments)
     with tempfile.TemporaryDirectory(prefix="fuzz-") as folder:
         corpus = (options.corpus or Path(folder) / "corpus").absolute()
-        prepare(corpus, options.real, options.jobs)
+        prepare(corpus, options.jobs)
         numbers = range(options.cases) if options.case is None else [options.case]
         cases = [Case(options.seed, number, corpus) for number in numbers]
         verdicts = []
@@ -63,11 +62,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return not all(verdict.good for verdict in verdicts)
 
 
-def prepare(corpus: Path, real: Path | None, jobs: int) -> None:
+def prepare(corpus: Path, jobs: int) -> None:
     """Import, write the corpus where it is not there, and see that it is read rightly as it is."""
     warm()
     if not (corpus / "ready").exists():
-        in_child(lambda: write_corpus(corpus, real))
+        in_child(lambda: write_corpus(corpus))
         wrong = [str(v) for v in run_cases(wholes(corpus), jobs) if v.outcome != "right"]
         assert not wrong, "\n".join(["what is as it was written is not read rightly:", *wrong])
         (corpus / "ready").touch()

@@ -17,16 +17,10 @@ def run_suite(*options: str) -> None:
 
 
 def test_cases_of_every_class() -> None:
-    run_suite("--cases", "22")
+    run_suite("--cases", "19")
 
 
 @pytest.mark.slow
 @pytest.mark.timeout(4 * 3600)
 def test_ten_thousand_cases() -> None:
     run_suite("--cases", "10000", "--seed", "1")
-
-
-@pytest.mark.slow
-@pytest.mark.timeout(3600)
-def test_real_recordings(shared_data: Path) -> None:
-    run_suite("--cases", "1000", "--seed", "2", "--real", str(shared_data))

@@ -1,16 +1,13 @@
 """Experiments side by side are one page: a table for each span of the chunk, and one picture."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
 from pipeline.base.text import Table
 from pipeline.evaluate.baselines import BASELINES
 from pipeline.evaluate.experiments import SPANS, Experiment, JudgedDocument
-from pipeline.evaluate.figures import NO_INTERVAL
-from pipeline.look.comparison import comparison_report, draw_experiments
-from pipeline.look.page.writing import PAGE, sentence, write_report
+from pipeline.look.comparison import comparison_report
+from pipeline.look.page.writing import PAGE, write_report
 
 
 @pytest.fixture
@@ -61,14 +58,3 @@ def test_experiments_are_one_page(experiments: list[Experiment]) -> None:
     assert report.verdict.startswith("regression-concat errs least in what is executed, ")
     assert report.verdict.endswith(("ahead of all others", "lead is not resolved"))
     assert comparison_report(experiments[:1]).verdict == "regression-concat stands alone"
-
-
-def test_one_group_is_drawn_without_whiskers_and_it_is_said(experiments: list[Experiment]) -> None:
-    first = experiments[0]
-    entries = {span: entries[:1] for span, entries in first.entries.items()}
-    errors = {key: errors[:, :1] for key, errors in first.errors.items()}
-    alone = replace(first, groups=first.groups[:1], entries=entries, errors=errors)
-    assert sentence(NO_INTERVAL) in comparison_report([alone]).summary
-    assert sentence(NO_INTERVAL) not in comparison_report(experiments).summary
-    executed, _ = draw_experiments([alone]).axes
-    assert not [line for line in executed.lines if line.get_marker() == "|"]

@@ -17,7 +17,7 @@ from pipeline.evaluate.evaluation import Evaluation, judged_document
 from pipeline.evaluate.figures import Figure, Rivalry, rivalry
 from pipeline.evaluate.tables import ablation_table, error_table
 from pipeline.look.evaluation import evaluation_report
-from pipeline.look.page.blocks import Outline, Picture, Report, Section, Text
+from pipeline.look.page.blocks import Outline, Report, Section
 from pipeline.look.page.writing import PAGE, write_report
 from pipeline.policy.checkpoint import PolicyCheckpoint
 from pipeline.policy.normalization import ChannelStatistics, Normalization
@@ -167,12 +167,6 @@ def test_an_anchored_policy_is_judged_by_rollouts(judgement, monkeypatch):
     assert "on purpose" in section(report, "What to do next").blocks[0].words
 
 
-def test_the_page_of_rollouts_is_linked_where_there_is_one(judgement: Evaluation) -> None:
-    for rollout in ("", f"../rollout/{PAGE}"):
-        pages = [block.page for block in evaluation_report(judgement, rollout).blocks(Text)]
-        assert list(filter(None, pages)) == ([rollout] if rollout else [])
-
-
 def test_what_spoils_the_judgement_stands_at_the_top(judgement: Evaluation) -> None:
     """Dimensions that hardly move, and episodes that were trained on before."""
     names = tuple(f"joint_{index}" for index in range(5))
@@ -193,19 +187,3 @@ def test_what_spoils_the_judgement_stands_at_the_top(judgement: Evaluation) -> N
 def test_the_page_is_sound(judgement, tmp_path, assert_page_is_sound):
     write_report(tmp_path, evaluation_report(judgement))
     assert_page_is_sound(tmp_path / PAGE)
-
-
-def test_the_worst_episode_is_shown(judgement):
-    comparison = judgement.comparison
-    worst = judgement.store.episodes[comparison.episodes[comparison.ranked()[-1]]]
-    pictures = {picture.name: picture for picture in evaluation_report(judgement).blocks(Picture)}
-    assert pictures.keys() == {"methods", "horizon", "episode_worst"}
-    shown = pictures["episode_worst"]
-    assert episode_name(worst) in shown.caption
-    assert len(shown.draw().axes) == len(comparison.varying())
-
-
-def test_streams_that_nobody_asked_for_are_said(judgement: Evaluation) -> None:
-    report = evaluation_report(replace(judgement, study=None))
-    (streams,) = section(report, "Which streams are used").blocks
-    assert streams.words.startswith("Not judged: `evaluate.modalities` is off")

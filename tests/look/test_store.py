@@ -1,7 +1,6 @@
 """The page of a store tells what is in it, and finds what was planted and nothing else."""
 
 import json
-import tracemalloc
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -16,7 +15,6 @@ from pipeline.look.page.writing import write_report
 from pipeline.look.store import (
     StoreView,
     inspect_store,
-    measure_features,
     store_report,
 )
 from pipeline.store import FeatureStore
@@ -83,20 +81,6 @@ class TestFacts:
         assert first.covered == {"sensor": 1.0, "state": 1.0, "View1": 0.5}
         assert second.covered["View1"] == 1
 
-    def test_of_variants_the_plain_frames_are_looked_at(self, tiny_store, tmp_path, plant):
-        path = tiny_store(tmp_path, slots=4)
-
-        def two_variants(attrs: dict[str, Any]) -> None:
-            attrs["feature_spec"]["variants"] = 2
-            attrs["slots"] = [one | {"variant": n // 2} for n, one in enumerate(attrs["slots"])]
-
-        attributes(path, two_variants)
-        plant(path, "vl/features", lambda rows: rows.__setitem__((slice(None), slice(2, 4)), 1e6))
-        view = look(path)
-        assert view.store.variants == 2
-        assert view.features.broken.shape == (6 * ROWS, 2)
-        assert view.features.variation.min() > 0.5
-
     def test_what_is_no_finished_store_says_what_to_run(self, path, tmp_path):
         with pytest.raises(StoreIncomplete, match=r"stages\.extract"):
             look(tmp_path / "none.zarr")
@@ -109,11 +93,6 @@ class TestFacts:
         attributes(archive, lambda attrs: attrs.update(archive={}))
         with pytest.raises(StoreMismatch, match=r"stages\.archive --restore"):
             look(archive)
-
-
-def test_of_many_rows_evenly_spread_ones_are_looked_at(tiny_store, tmp_path):
-    health = look(tiny_store(tmp_path, episodes=30), points=100).features
-    assert health.rows[:6].tolist() == [0, 3, 6, 9, 12, 15] and len(health.rows) == 100
 
 
 class TestIntegrity:
@@ -176,17 +155,6 @@ class TestIssues:
         assert view.issues == ()
 
 
-def test_one_slot_at_a_time_is_in_memory(tiny_store, tmp_path):
-    store = FeatureStore.open(tiny_store(tmp_path, slots=24, dim=512, episodes=20))
-    whole = store.array("vl/features").nbytes
-    assert whole > 9e6
-    tracemalloc.start()
-    measure_features(store, np.arange(200))
-    peak = tracemalloc.get_traced_memory()[1]
-    tracemalloc.stop()
-    assert peak < whole / 3
-
-
 @pytest.fixture(scope="module")
 def view(tiny_store, reseal, tmp_path_factory) -> StoreView:
     """A store in which the rows of an episode are those of another."""
@@ -205,19 +173,6 @@ def report(view) -> Report:
 
 def blocks(report: Report, title: str) -> list:
     return list(next(one for one in report.sections if one.title == title).blocks)
-
-
-def test_the_sum_of_the_sources_is_the_store(report, view):
-    table = blocks(report, "Coverage")[0]
-    assert [row[0] for row in table.rows] == ["left", "right"]
-    own = [part.episode for part in view.episodes]
-    seconds = sum(part.seconds for part in view.episodes)
-    kinds = ("ticks", "vl_rows", "readings", "states")
-    whole = [len(own), seconds, *(sum(len(getattr(one, kind)) for one in own) for kind in kinds)]
-    sums = [sum(row[column] for row in table.rows) for column in range(3, len(table.columns))]
-    assert sums == pytest.approx(whole, abs=0.1)
-    assert sums[2] == view.store.ticks
-    assert dict(report.tiles)["ticks"] == f"{view.store.ticks}"
 
 
 def test_the_page_says_what_was_read_and_what_the_store_was_made_of(report, view):

@@ -6,7 +6,6 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from pipeline.policy.denoiser import MOST_GAIN, gain, pull
 from pipeline.policy.diffusion import DiffusionActionExpert
 from pipeline.policy.expert import ActionExpert, Guide
 from pipeline.policy.flow_matching import FlowMatchingActionExpert
@@ -130,25 +129,3 @@ def test_what_the_clip_holds_is_still_pulled():
     free, guided = (expert.act(context, torch.Generator(), given) for given in (None, guide))
     assert free.abs().median() == 5.0
     assert (guided - guide.chunk).square().mean() < 1e-2
-
-
-class TestGain:
-    def test_it_is_that_of_the_paper(self):
-        for tau in (0.25, 0.5, 0.7):
-            r2 = (1 - tau) ** 2 / (tau**2 + (1 - tau) ** 2)
-            assert gain(tau, 1 - tau) == pytest.approx((1 - tau) / (tau * r2))
-        assert gain(0.3, 0.4) == pytest.approx(gain(3, 4)), "it knows no scale"
-
-    def test_it_is_bounded_near_both_ends(self):
-        for tau in (0.0, 1e-9, 0.1, 0.95, 1.0):
-            assert gain(tau, 1 - tau) == MOST_GAIN == 5.0
-
-
-def test_pull_is_the_vector_jacobian_product():
-    """Of a linear clean chunk, in closed form."""
-    matrix = torch.randn(4, 4)
-    noisy = torch.randn(2, 4, 1, requires_grad=True)
-    guide = Guide(torch.randn(2, 4, 1), torch.rand(2, 4))
-    clean = matrix @ noisy
-    error = guide.weight.unsqueeze(-1) * (guide.chunk - clean.detach())
-    torch.testing.assert_close(pull(clean, noisy, guide), matrix.T @ error)

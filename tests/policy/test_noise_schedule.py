@@ -56,16 +56,6 @@ class TestBuffers:
         assert torch.equal(fresh.signal, trained.signal)
 
 
-def test_the_noise_of_all_single_steps_is_that_of_one_jump(schedule):
-    """Ho et al. 2020: eq. 2, applied t times, is eq. 4."""
-    signal, variance = 1.0, 0.0
-    for step in EVERY.tolist():
-        alpha = float(schedule.alpha_bar[step] / schedule.alpha_bar[step - 1])
-        signal, variance = signal * math.sqrt(alpha), variance * alpha + 1 - alpha
-        assert float(schedule.signal[step]) == pytest.approx(signal, rel=1e-5)
-        assert float(schedule.noise[step]) ** 2 == pytest.approx(variance, rel=1e-3)
-
-
 @pytest.mark.parametrize("kind", ["epsilon", "sample", "v"])
 def test_each_prediction_gives_back_sample_and_noise(kind, schedule, sample, epsilon):
     noisy = schedule.add_noise(sample, epsilon, EVERY)

@@ -9,11 +9,9 @@ from scipy.spatial.transform import Rotation
 
 from pipeline.base.config import TrainHeadParams
 from pipeline.base.errors import ConfigError
-from pipeline.base.observation import Observation
 from pipeline.policy.expert import Guide
 from pipeline.policy.robot_state import Anchoring, RelativeActions, state_at_frame
 from pipeline.policy.shape import Anchor, channel_kinds, find_anchors, find_relative
-from pipeline.robot.export import Head, trace
 
 POSE = {
     "names": ["joint_1", "pose_x", "pose_y", "pose_z", "pose_a", "pose_b", "pose_r"],
@@ -50,15 +48,6 @@ def test_the_state_is_interpolated_on_its_clock(moving):
     turn = torch.tensor([2 * np.pi, *[torch.inf] * 3, 360.0, 360.0, 360.0])
     change = torch.where(turn.isinf(), change, (change + turn / 2) % turn - turn / 2)
     torch.testing.assert_close(change, -moving.feature_age[:, None] * SPEED, atol=2e-4, rtol=0)
-
-
-def test_before_the_first_reading_it_is_that_reading(moving):
-    few = replace(moving, state_valid=torch.full((4,), 5))
-    few.state_age[:, :-5] = 0
-    few.state[:, :-5] = 0
-    torch.testing.assert_close(state_at_frame(few, KINDS)[3], few.state[3, -5])
-    one = replace(few, state_valid=torch.ones(4, dtype=torch.int64))
-    torch.testing.assert_close(state_at_frame(one, KINDS), one.state[:, -1])
 
 
 def test_a_step_counts_from_the_frame_and_back(moving):
@@ -151,18 +140,6 @@ def test_older_readings_tell_the_motion_and_nothing_else(build_policy, observe):
     assert tokens.equal(
         policy._encode_window("state", replace(seen, state=seen.state + 5.0), none)
     ), "a state that is dropped is missing, however old its readings are"
-
-
-@pytest.mark.slow  # torch.export
-def test_an_exported_head_counts_likewise(build_policy, observe, shape):
-    small = {"dim": 8, "layers": 1, "heads": 2, "dropout": 0.0}
-    policy = build_policy(sensor_enabled=False, fusion_strategy="none", expert=small).eval()
-    policy.anchoring = Anchoring((Anchor((0, 1), (3, 4)),), shape.kinds)
-    head = Head(policy).requires_grad_(False)
-    fields = {name: getattr(observe(2), name) for name in Observation.__dataclass_fields__}
-    program = trace(head, fields).module()
-    other = {name: getattr(observe(3), name) for name in fields}
-    torch.testing.assert_close(program(**other), head(**other))
 
 
 @pytest.fixture

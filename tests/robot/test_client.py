@@ -93,16 +93,6 @@ def test_a_late_answer_is_never_taken_for_the_next(served_policy, serving, obser
             client.infer(observe(7))
 
 
-def test_a_lost_connection_says_that_the_memory_is_gone(served_policy, serving, observe) -> None:
-    server = serving(served_policy())
-    with PolicyClient(f"ws://{server.address}") as client:
-        client.infer(observe(0))
-        server.stop()
-        with pytest.raises(ServerError, match=r"the server is stopping.*of this robot is gone"):
-            for tick in range(1, 1000):
-                client.infer(observe(tick))
-
-
 METADATA = {
     "streams": {
         "state": {"names": ["a", "b", "c"], "units": ["deg", "deg", "mm"]},

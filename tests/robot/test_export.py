@@ -204,32 +204,6 @@ def test_every_format_is_the_policy(kind: dict[str, Any], export_of) -> None:
         assert_same(onnx_runner(done.folder / "head.onnx"), done.checkpoint, 2e-5)
 
 
-@pytest.mark.parametrize(
-    ("kind", "draws"),
-    [
-        ({"model_type": "regression"}, 0),
-        ({"model_type": "diffusion", "diffusion": {"timesteps": 6, "sampler": "ddpm"}}, 7),
-    ],
-    ids=str,
-)
-def test_the_noise_is_what_the_policy_asks_for(kind: dict[str, Any], draws: int) -> None:
-    """Random inputs miss each stream, and are old."""
-    checkpoint = checkpoint_of(**kind)
-    policy = checkpoint.policy()
-    given = random_inputs(checkpoint, policy, 16)
-    assert ("noise" in given) == (draws > 0)
-    if draws:
-        assert given["noise"].shape == (16, draws, 4, 3)
-        other = given | {"noise": given["noise"] + 1}
-        assert not torch.equal(Head(policy)(**given), Head(policy)(**other))
-    assert not given["slot_valid"].any(dim=1).all()
-    for stream in ("sensor", "state"):
-        assert given[f"{stream}_valid"].min() == 0
-        assert given[f"{stream}_valid"].max() == given[stream].shape[1]
-        assert given[f"{stream}_age"].max() > 0
-    assert given["view_age"].isnan().any() and given["feature_age"].max() > 5
-
-
 def test_the_receipt_says_what_goes_in_and_comes_out(export_of) -> None:
     _, folder, receipt = export_of(FLOW)
     assert json.loads((folder / "receipt.json").read_text()) == receipt

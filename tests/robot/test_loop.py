@@ -88,14 +88,6 @@ class TestSteps:
         executor.plan(np.ones((HORIZON, 2)))
         assert play(executor, 2) == [1, 1]
 
-    def test_a_chunk_is_copied(self, chunking: Chunking) -> None:
-        executor, buffer = Executor(chunking, 2, HORIZON), chunk_of(0)
-        take(executor, buffer)
-        buffer[:] = -1
-        action = executor.next_action()
-        action[:] = -1
-        assert play(executor, 2) == [1, 2] and action.dtype == np.float32
-
     @given(st.lists(st.tuples(st.booleans(), st.integers(0, 3)), max_size=30))
     def test_whatever_the_delays_every_step_is_that_of_its_tick(self, chunking, turns):
         """Others drop as many steps as the computation is believed to have taken."""

@@ -137,11 +137,6 @@ def test_what_the_policy_lacks_is_refused(observe) -> None:
         lacking.read(observe(0, sensor=None, sensor_time=None) | guide)
 
 
-def test_a_single_reading_has_no_axis(reader) -> None:
-    read = reader.read({"state": STATE[0].tolist(), "time": 1.0})
-    np.testing.assert_array_equal(read.readings["state"], STATE[:1])
-
-
 def test_what_cannot_be_true_is_doubted_once(reader, observe) -> None:
     doubts, state = Doubts(), np.zeros((1, 12))
     black = {"images/View1": np.zeros((4, 6, 3), np.uint8)}

@@ -4,7 +4,6 @@ Time is simulated, so a busy machine changes nothing: only sleeping moves the cl
 comes when the policy's latency is over. `TestThreads` has the real clock and the real thread.
 """
 
-import gc
 import signal
 import sys
 import threading
@@ -465,15 +464,6 @@ def test_a_signal_that_the_process_passes_over_does_not_end_the_run() -> None:
         signal.signal(signal.SIGTERM, kept)
 
 
-def test_a_run_on_another_thread_leaves_signals_alone() -> None:
-    reports = list[RunReport]()
-    short = replace(CALM, seconds=0.05)
-    running = threading.Thread(target=lambda: reports.append(run_robot(Arm(), Brain(), short)))
-    running.start()
-    running.join(30)
-    assert [report.kind for report in reports] == [StopKind.TIME]
-
-
 class Stubborn(Arm):
     """Its first `stop` fails."""
 
@@ -528,23 +518,6 @@ def test_an_action_that_the_robot_failed_at_is_recorded() -> None:
 
 
 @pytest.mark.parametrize(
-    ("spoil", "kind", "said"),
-    [
-        (
-            put("state", np.zeros((2, 3), np.float32)),
-            StopKind.ROBOT,
-            "state: expected (2, 2), found (2, 3)",
-        ),
-        (put("state", np.array([[0.1, None], [0.1, None]], object)), StopKind.LOOP, "check"),
-    ],
-)
-def test_readings_that_cannot_be_checked_are_kept_from_the_recording(spoil, kind, said):
-    arm, notes = Arm(after(9, spoil)), Notes()
-    stopped(arm, kind, said, recorder=notes)
-    assert len(notes.ticks) == 9
-
-
-@pytest.mark.parametrize(
     ("changed", "said"), [({"hz": 100.0}, r"hz=100, .* found 200"), ({"execute": 41}, "execute")]
 )
 def test_what_does_not_fit_is_refused_before_anything_is_asked(changed, said):
@@ -552,16 +525,6 @@ def test_what_does_not_fit_is_refused_before_anything_is_asked(changed, said):
     with pytest.raises(ConfigError, match=said):
         run_robot(arm, Brain(), replace(CALM, **changed), limits(step={"most": {"dx": 1}}))
     assert not arm.ticks and not arm.stops
-
-
-def test_the_process_is_afterwards_as_it_was() -> None:
-    def look(tick: int) -> None:
-        within.append((sys.getswitchinterval(), gc.isenabled()))
-
-    before, within = (sys.getswitchinterval(), gc.isenabled()), list[Any]()
-    run_robot(Arm(moves=look), Brain(), replace(CALM, seconds=0.05))
-    assert before == (sys.getswitchinterval(), gc.isenabled())
-    assert set(within) == {(5e-4, False)}
 
 
 class TestThreads:

@@ -338,11 +338,3 @@ def test_a_run_without_an_observation_is_no_recording_and_a_finished_one_not_rec
     with pytest.raises(RecordingError, match=r"expected what is left of a run, run_NNNNNN\.part"):
         recover(path)
     assert opened(path).action() is not None
-
-
-def test_a_folder_that_cannot_be_made_is_named(tmp_path) -> None:
-    (tmp_path / "file").write_text("no folder")
-    with pytest.raises(
-        RecordingError, match=r"file/runs: runs cannot be recorded there: Not a dir"
-    ):
-        RunRecorder(tmp_path / "file" / "runs", metadata_of(), "touch")

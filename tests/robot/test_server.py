@@ -94,20 +94,6 @@ def test_observations_of_one_connection_are_answered_in_order(served_policy, ser
     np.testing.assert_allclose(ages, [0, 0.1, 0.2, 0, 0.1, 0.2, 0], atol=1e-6)
 
 
-def test_while_the_model_looks_healthz_answers(served_policy, serving, observe):
-    served = served_policy()
-    server = serving(served)
-    with client_of(server) as client:
-        blocked, answers = Blocked(served), list[Any]()
-        thread = threading.Thread(target=lambda: answers.append(client.infer(observe(0))))
-        thread.start()
-        assert blocked.looking.wait(60)
-        assert get(server, "/healthz")[:2] == (200, "OK\n")
-        blocked.go.set()
-        thread.join()
-    assert answers[0]["actions"].shape == (4, 7)
-
-
 def array_of(dtype: str, shape: Any, data: bytes) -> dict[bytes, Any]:
     return {b"__ndarray__": True, b"dtype": dtype, b"shape": shape, b"data": data}
 

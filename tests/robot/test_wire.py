@@ -80,6 +80,7 @@ def number_of(dtype: Any, value: Any) -> bytes:
         (array_of("<f4", [2], b"0" * 4), "expected 8 bytes"),
         (array_of("<f4", [-1], b""), "shape of an array"),
         (array_of("<f4", [1] * 9, b"0" * 4), "shape of an array"),
+        (array_of("<f4", [2**31, 2**62], b"0" * 4), "expected 39614081257132168796771975168 bytes"),
         (array_of("<f4", [1], "0000"), "expected 4 bytes for an array of float32, found str"),
         (number_of("<i2", 70_000), "expected a message in msgpack"),
         (number_of("<i2", "7"), "expected a number"),

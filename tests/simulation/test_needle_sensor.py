@@ -39,35 +39,6 @@ def test_nothing_is_brighter_than_the_surface(distance, layer_depth, gain, seed)
     np.testing.assert_array_equal(scan, np.rint(scan))
 
 
-@given(st.floats(5.4, 100.0))
-def test_tissue_out_of_range_leaves_the_background(distance: float) -> None:
-    sensor = NeedleSensor(1.0, 0)
-    scans = sensor.a_scans(outside(distance, 2.0, 3), np.zeros(3), np.random.default_rng(0))
-    assert np.ptp(scans) <= 6
-
-
-def test_a_strong_signal_saturates() -> None:
-    scans = [
-        NeedleSensor(1.08, seed).a_scans(outside(0.5, 2.0, 1), NOW, np.random.default_rng(0))
-        for seed in range(20)
-    ]
-    assert max(scan.max() for scan in scans) == 255
-
-
-def test_speckle_belongs_to_the_tissue_and_to_the_episode() -> None:
-    """It moves with the tissue towards the tip, and another episode has another."""
-
-    def behind(sensor: NeedleSensor, distance: float) -> np.ndarray:
-        scan = sensor.a_scans(outside(distance, 3.0, 1), NOW, np.random.default_rng(1))[0]
-        # The light behind the surface, clear of both peaks.
-        first = round(distance / BIN_MM) + 80
-        return scan[first : first + 250]
-
-    one, other = NeedleSensor(1.0, 1), NeedleSensor(1.0, 2)
-    near, far, strange = behind(one, 0.5), behind(one, 1.0), behind(other, 1.0)
-    assert np.abs(near - far).mean() < 1.0 < np.abs(far - strange).mean()
-
-
 def test_each_scan_is_read_five_times_and_each_force_once() -> None:
     rows = NeedleSensor(1.0, 0).read(outside(1.0, 2.0, 650), 0.0, np.random.default_rng(0))
     assert rows.shape == (650, 1 + A_SCAN_BINS) and rows.dtype == np.float32

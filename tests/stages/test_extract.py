@@ -2,19 +2,14 @@
 
 import json
 import re
-import subprocess
-import sys
 from pathlib import Path
 
-import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 import yaml
 import zarr
 
-from pipeline.simulation.insertion_formats import write_lerobot
-from pipeline.simulation.recorder import simulate_episode
 from pipeline.store import FeatureStore
 from pipeline.store.chunks import write_seal
 from stages.command import run
@@ -74,16 +69,6 @@ def test_an_absolute_path_is_watched_where_it_is_in_the_root(capsys, params_file
     assert f"{source} is outside data.root ({other}), so DVC does not watch it" in said
 
 
-def test_a_depth_map_that_is_asked_for_as_a_view(capsys, params_file, tmp_path):
-    write_lerobot(tmp_path / "day1/run", iter([simulate_episode(4, 0.0)]))
-    info = tmp_path / "day1/run/meta/info.json"
-    document = json.loads(info.read_text())
-    document["features"]["observation.images.View2"]["info"] = {"is_depth_map": True}
-    info.write_text(json.dumps(document))
-    assert "data.views asks for View2" in refused(capsys, params_file, "data.views=[View1, View2]")
-    planned(capsys, params_file)
-
-
 def test_a_trimmed_copy_is_read_without_the_episodes_before_and_behind(
     capsys, params_file, tmp_path
 ):
@@ -91,24 +76,6 @@ def test_a_trimmed_copy_is_read_without_the_episodes_before_and_behind(
     path = root / "meta/episodes/chunk-000/file-000.parquet"
     pq.write_table(pq.ParquetFile(path).read().slice(1, 1), path)
     planned(capsys, params_file)
-
-
-@pytest.mark.parametrize(("name", "dtype"), [("sensor", "float32"), ("state", "float16")])
-def test_the_clock_of_a_sidecar_may_be_narrow_where_it_begins_at_zero(
-    capsys, params_file, tmp_path, name, dtype
-):
-    root = write_small_lerobot(tmp_path / "day1/run", lengths=(7,))
-    (root / name).mkdir()
-    time = np.linspace(0, 0.8, 60)
-    for start, code in ((0.0, 0), (30_000.0, 0 if dtype == "float32" else 2)):
-        table = pq.read_table(data := root / "data/chunk-000/episode_000000.parquet")
-        clock = table.column_names.index("timestamp")
-        pq.write_table(table.set_column(clock, "timestamp", [np.arange(7) / 10 + start]), data)
-        values = np.random.default_rng(0).normal(size=(60, 2))
-        clock = (time + start).astype(dtype)
-        np.savez(root / name / "episode_000000.npz", timestamps=clock, values=values)
-        options = ["--params", str(params_file), "--set", "extract.plan=true"]
-        assert run("", main, options) == code, capsys.readouterr().err
 
 
 def halved(root: Path) -> Path:
@@ -147,14 +114,6 @@ def test_a_store_of_recorded_rows_says_their_rate(capsys, params_file, tmp_path)
     assert FeatureStore.open(store).action_hz == 10
 
 
-def test_recorded_rows_without_a_rate(capsys, params_file, tmp_path, monkeypatch):
-    """No format of today lacks it: a clock of one row, by a reader that knows no rate."""
-    monkeypatch.setattr("pipeline.data.timeline._recorded_hz", lambda *_: None)
-    write_small_lerobot(tmp_path / "day1/run")
-    err = refused(capsys, params_file, "data.action_hz=null", "extract.plan=true")
-    assert re.search(r"day1/run.* a single action, which tells no rate.*Set data\.action_hz", err)
-
-
 def test_recordings_without_any_frame(capsys, params_file, tmp_path):
     info = write_small_lerobot(tmp_path / "day1/run") / "meta/info.json"
     features = json.loads(info.read_text())["features"]
@@ -162,24 +121,6 @@ def test_recordings_without_any_frame(capsys, params_file, tmp_path):
     edit_json(info, features=blind)
     assert "WARNING: none of the 3 episode(s) has a frame" in planned(capsys, params_file)
     assert "has a frame" not in planned(capsys, params_file, "data.views=[]")
-
-
-def test_a_plan_of_known_files_asks_its_ledger_once_and_needs_no_pandas(params_file, tmp_path):
-    write_small_lerobot(tmp_path / "day1/run", "v3.0", image=True)
-    code = (
-        "import sys\nfrom pipeline.base.digests import ContentDigests\n"
-        "from stages.command import run\nfrom stages.extract import main\n"
-        "ask, asked = ContentDigests._query, []\n"
-        "ContentDigests._query = lambda own, *told: [asked.append(told[0]), ask(own, *told)][1]\n"
-        "for _ in range(2):\n    asked.clear()\n"
-        "    assert not run('', main, sys.argv[1:])\n"
-        "print(sum(told.startswith('SELECT') for told in asked), 'pandas' in sys.modules)"
-    )
-    command = [sys.executable, "-c", code, "--params", str(params_file)]
-    done = subprocess.run(
-        [*command, "--set", "extract.plan=true"], cwd=ROOT, capture_output=True, text=True
-    )
-    assert done.stdout.splitlines()[-1:] == ["1 False"], done.stderr
 
 
 def test_the_first_ten_of_many_bad_episodes_are_listed(capsys, params_file, tmp_path):
@@ -198,20 +139,6 @@ def test_the_first_ten_of_many_bad_episodes_are_listed(capsys, params_file, tmp_
     assert "\nand 3 more skipped episodes" in out
     assert out.count("not there: lab: ") == 10
     assert "\nand 2 more episodes that are not there" in out
-
-
-def test_channel_names_of_two_embodiments_are_shown_without_control_characters(
-    capsys, params_file, tmp_path
-):
-    for day, name in (("day1", "force"), ("day2", "a\n\x1b[31m")):
-        root = write_small_lerobot(tmp_path / day / "run", lengths=(7,))
-        (root / "sensor").mkdir()
-        members = {"timestamps": np.arange(70) / 100, "values": np.arange(70.0)[:, None]}
-        np.savez(root / "sensor/episode_000000.npz", **members, names=[name], units=["N"])
-    sources = "[{name: one, path: day1/run}, {name: two, path: day2/run}]"
-    err = refused(capsys, params_file, f"data.sources={sources}", "extract.plan=true")
-    assert "1 channels ['a\\n\\x1b[31m (N)']" in err
-    assert "\x1b" not in err
 
 
 def test_what_to_set_instead_is_named(capsys, params_file, tmp_path):

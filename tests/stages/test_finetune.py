@@ -16,23 +16,6 @@ from tests.train.finetuning.conftest import write_episode
 Said = pytest.CaptureFixture[str]
 Make = Callable[..., Any]
 
-HELD = """
-import sys, time
-from pipeline.train.loop import Trainer
-from stages import finetune
-from stages.command import run
-
-step = Trainer._train_step
-def held(self, batches):
-    step(self, batches)
-    if self.step == 3:
-        print("holding", flush=True)
-        time.sleep(600)
-Trainer._train_step = held
-sys.exit(run("", finetune.main, ["--params", sys.argv[1]]))
-"""
-"""A tuning that waits after its third step until it is killed."""
-
 
 @pytest.fixture(scope="session")
 def extracted(tmp_path_factory: pytest.TempPathFactory, demo_checkpoint: Path) -> Path:
@@ -144,27 +127,6 @@ def test_it_tunes_and_says_how_to_go_on_and_that_works(
     capsys.readouterr()
     assert run("", evaluate.main, ["--params", params, *options]) == 2
     assert "feature_spec.adapter" in capsys.readouterr().err, "these features are not the tuned"
-
-
-@pytest.mark.slow
-def test_killed_in_mid_run_it_ends_where_an_undisturbed_run_ends(
-    started_until, write_params, tmp_path, capsys
-):
-    process = started_until(HELD, write_params("killed"), "holding")
-    assert run("", finetune.main, ["--params", str(write_params("killed"))]) == 2
-    assert "being built by process" in capsys.readouterr().err
-    process.kill()
-    process.communicate()
-    assert (tmp_path / "killed.part/last/adapter/adapter_config.json").exists()
-    for name in ("undisturbed", "killed"):
-        assert run("", finetune.main, ["--params", str(write_params(name))]) == 0
-    said = capsys.readouterr().out
-    assert "resuming the run in" in said
-    assert "steps 2 to 4" in said
-    for name in ("best", "last"):
-        for file in ("policy.safetensors", "adapter/adapter_model.safetensors"):
-            one, other = (tmp_path / run / name / file for run in ("undisturbed", "killed"))
-            assert one.read_bytes() == other.read_bytes()
 
 
 def test_mistakes_end_in_one_message(write_params: Make, tmp_path: Path, capsys: Said) -> None:

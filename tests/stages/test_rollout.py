@@ -5,9 +5,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import yaml
 
-from stages import rollout, train_head
+from stages import rollout
 from stages.command import run
 
 Said = pytest.CaptureFixture[str]
@@ -50,19 +49,6 @@ def test_what_cannot_be_run_is_refused_by_name(trained: Path, capsys: Said) -> N
     assert run("", rollout.main, [*arguments(trained), *other]) == 2
     assert "the policy was trained on other features" in capsys.readouterr().err
     assert not (trained.parent / "rollout").exists()
-
-
-def test_a_policy_of_another_robot_is_refused(quick_params, tmp_path, capsys):
-    path = tmp_path / "params.yaml"
-    path.write_text(yaml.safe_dump(quick_params(tmp_path)))
-    assert run("", train_head.main, ["--params", str(path)]) == 0
-    assert run("", rollout.main, ["--params", str(path)]) == 2
-    err = capsys.readouterr().err
-    assert "trained on another robot than phantom: " in err
-    assert "metaworld:TASK (docs/rollout.md)" in err and "set rollout.environment to null" in err
-    nothing = ["--set", "rollout.environment=null", "--set", f"rollout.output={tmp_path / 'none'}"]
-    assert run("", rollout.main, ["--params", str(path), *nothing]) == 0
-    assert json.loads((tmp_path / "none" / "metrics.json").read_text()) == {"success": {}}
 
 
 def test_a_folder_of_somebody_else_is_left_alone(trained, tmp_path, capsys):

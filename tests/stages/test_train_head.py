@@ -2,7 +2,6 @@
 
 import json
 import os
-import signal
 import subprocess
 import sys
 from collections.abc import Callable
@@ -46,29 +45,6 @@ heavy = "torch transformers dask distributed scipy matplotlib sklearn pandas"
 print(sorted(set(heavy.split()) & sys.modules.keys()))
 """
 """A finished training, which says what it imported of what takes long."""
-HELD = """
-import sys, time
-from contextlib import contextmanager
-from pipeline.train import loop
-from stages import train_head
-from stages.command import run
-
-step, deferred, within = loop.Trainer._train_step, loop.deferred_interrupt, []
-@contextmanager
-def watched():
-    with deferred() as interrupted:
-        within.append(interrupted)
-        yield interrupted
-def held(self, batches):
-    if self.step == {step}:
-        print("holding", flush=True)
-        while not within[-1]():
-            time.sleep(0.01)
-    step(self, batches)
-loop.Trainer._train_step, loop.deferred_interrupt = held, watched
-sys.exit(run("", train_head.main, ["--params", sys.argv[1]]))
-"""
-"""A training that waits after this step until it is stopped."""
 
 
 LONGER = {
@@ -106,13 +82,6 @@ def write_params(
         return path
 
     return write
-
-
-def test_a_logger_that_is_not_installed_is_named(write_params, monkeypatch, capsys):
-    monkeypatch.setattr("pipeline.train.log._MODULES", {"wandb": "no_such_module"})
-    assert run("", train_head.main, ["--params", str(write_params(loggers=["wandb"]))]) == 2
-    said = capsys.readouterr().err
-    assert "cannot load the package of wandb (No module named 'no_such_module')" in said
 
 
 def test_it_trains_evaluates_and_then_has_nothing_to_do(started, write_params, tmp_path):
@@ -155,19 +124,6 @@ def test_two_runs_do_not_write_their_curves_into_one_folder(write_params, tmp_pa
     assert f"{logs}: being built by process {os.getpid()} on" in said
     assert f"name another place than {logs}" in said
     assert run("", train_head.main, arguments) == 0, "the same run goes on"
-
-
-@pytest.mark.slow
-def test_a_sigterm_leaves_the_step_it_came_in(started_until, write_params, tmp_path):
-    params = write_params(checkpoint_every=1000)
-    process = started_until(HELD.format(step=6), params, "holding")
-    process.send_signal(signal.SIGTERM)
-    _, err = process.communicate()
-    assert process.returncode == 1
-    assert "run the same command again" in err
-    assert "Traceback" not in err
-    last = json.loads((tmp_path / "params/head.part/last/trainer.json").read_text())
-    assert last["step"] == 7
 
 
 def test_mistakes_end_in_one_message(write_params: Make, tmp_path: Path, capsys: Said) -> None:

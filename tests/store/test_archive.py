@@ -4,7 +4,6 @@ import json
 import os
 import random
 import shutil
-import subprocess
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -23,7 +22,6 @@ from pipeline.store.archive import archive, is_archive, restore
 from pipeline.store.schema import INCREMENTAL, read_specs
 from tests.store.samples import TEXT, attributes_of, content, edit, flip, index_of, put
 
-DEMO = Path(__file__).resolve().parents[2] / "cache_store/demo.zarr"
 SIZES = Sizes(
     episode=2,
     tick=500,
@@ -127,15 +125,6 @@ def test_chunks_of_the_real_sizes(tiny_store, tmp_path):
     assert content(back) == content(store)
 
 
-@pytest.mark.slow
-def test_the_demos_store(tmp_path):
-    if not DEMO.is_dir():
-        pytest.skip("no demo store: run dvc repro")
-    archive(DEMO, tmp_path / "a.zarr", level=5, threads=2)
-    restore(tmp_path / "a.zarr", tmp_path / "back.zarr", threads=2)
-    assert subprocess.run(["diff", "-r", DEMO, tmp_path / "back.zarr"]).returncode == 0
-
-
 class TestArchive:
     def test_plain_zarr_and_dask_read_it(self, originals):
         store, output = originals / "s.zarr", originals / "s.archive.zarr"
@@ -180,14 +169,6 @@ class TestArchive:
             archive(originals / "s.zarr", output, level=1, threads=1)
         with build_lock(target), pytest.raises(StoreLocked):
             restore(originals / "s.archive.zarr", target, threads=2)
-
-    def test_from_a_disk_that_cannot_be_written(self, originals, small_disk, tmp_path):
-        names = ("s.zarr", "s.archive.zarr")
-        store, output = (shutil.copytree(originals / name, small_disk / name) for name in names)
-        subprocess.run(["mount", "-o", "remount,ro", str(small_disk)], check=True)
-        archive(store, tmp_path / "a.zarr", level=1, threads=2)
-        restore(output, tmp_path / "back.zarr", threads=2)
-        assert content(tmp_path / "back.zarr") == content(store)
 
 
 def sealed_wrong(store: Path) -> None:

@@ -4,7 +4,6 @@ import threading
 import time
 from collections.abc import Iterator
 from dataclasses import replace
-from itertools import count
 
 import numpy as np
 import pytest
@@ -115,28 +114,6 @@ def test_the_plan_is_consumed_no_further_ahead_than_there_are_buffers(store):
         next(batches)
         time.sleep(0.05)
         assert len(taken) <= 3
-
-
-def test_waiting_is_measured(store, monkeypatch):
-    """Each batch takes 30 ms of a clock that stands still until somebody waits for it."""
-    looks, now, waiting = count(1), [0.0], threading.Semaphore(0)
-
-    def clock() -> float:
-        value = now[0]
-        if next(looks) % 2:  # before the wait, and not behind it
-            waiting.release()
-        return value
-
-    def slow() -> Iterator[BatchIndices]:
-        for step in range(3):
-            waiting.acquire()
-            now[0] += 0.03
-            yield at(step)
-
-    monkeypatch.setattr("pipeline.train.batches.time.perf_counter", clock)
-    with Prefetch(store, slow(), WINDOWS, CPU) as batches:
-        assert len(list(batches)) == 3
-        assert batches.waited_s == pytest.approx(0.09)
 
 
 def test_a_disabled_encoder_costs_a_single_reading():

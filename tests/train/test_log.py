@@ -2,8 +2,6 @@
 
 import errno
 import json
-import os
-import subprocess
 import sys
 from collections.abc import Mapping
 from pathlib import Path
@@ -17,23 +15,7 @@ from pipeline.base.files import MARKER, read_document, write_document
 from pipeline.train import log as loggers
 from pipeline.train.log import TrainingLog, check_loggers
 
-ROOT = Path(__file__).resolve().parents[2]
 LOGS = {MARKER, "plots", "metrics.json"}
-WANDB = """
-import sys
-from pathlib import Path
-from pipeline.base.config import TrainHeadParams
-from pipeline.train.log import WandB
-
-place = Path(sys.argv[1])
-params = TrainHeadParams(output=place / "head")
-for resumed in (False, True):
-    run = WandB(place / "logs.wandb", params, resumed)
-    print(run.note, (place / "logs.wandb/id").read_text())
-    run.write(10, {"train/loss": 0.125})
-    run.write(10, {"val/error": 0.375})
-    run.close(finished=True)
-"""
 
 
 class Kept:
@@ -162,35 +144,6 @@ def test_a_full_disk_is_named_and_every_logger_is_closed(tmp_path, monkeypatch):
     assert kept.closed == full.closed == [False]
 
 
-@pytest.mark.slow
-@pytest.mark.extra
-def test_weights_and_biases_keeps_a_run_offline_and_goes_on_under_its_id(tmp_path):
-    # A folder `wandb`, as it leaves where it runs, is no package: it has none of its modules.
-    pytest.importorskip(
-        "wandb.sdk", reason="wandb is not installed: pip install 'vla-feature-cache[loggers]'"
-    )
-    private = {f"WANDB_{name}_DIR": str(tmp_path / name) for name in ("CONFIG", "CACHE", "DATA")}
-    ran = subprocess.run(
-        [sys.executable, "-c", WANDB, str(tmp_path)],
-        capture_output=True,
-        text=True,
-        timeout=100,
-        env=os.environ
-        | private
-        | {"WANDB_MODE": "offline", "WANDB_PROJECT": "needles", "PYTHONPATH": str(ROOT)},
-    )
-    assert (ran.returncode, ran.stderr) == (0, "")
-    first, again = ran.stdout.splitlines()
-    assert first.startswith(f"wandb is offline; wandb sync {tmp_path}/logs.wandb/")
-    identifier = (tmp_path / "logs.wandb/id").read_text()
-    assert first.split()[-1] == again.split()[-1] == identifier
-    for kept in (tmp_path / "logs.wandb").rglob("*.wandb"):
-        assert identifier in kept.name
-        content = kept.read_bytes()
-        for text in (b"needles", b"train/loss", b"0.125", b"val/error", b"0.375", b"max_steps"):
-            assert text in content, text
-
-
 class Service:
     """Stands for wandb: a run of which the service has rows up to `starting_step`."""
 
@@ -237,12 +190,3 @@ def test_rows_that_the_service_has_are_not_sent_again_and_its_loss_stops_nothing
     assert service.logged == [(30, {"train/loss": 1.0})]
     run.close(finished=True)
     assert "not everything could be sent (the service is gone)" in capsys.readouterr().out
-
-
-def test_a_service_that_takes_no_run_is_said_before_anything_is_done(
-    store, params, trainer, monkeypatch
-):
-    monkeypatch.setitem(sys.modules, "wandb", Service(refuses="no API key."))
-    with pytest.raises(ConfigError, match=r"no API key\. Log in with `wandb login`"):
-        trainer(store, params(loggers=["wandb"])).fit()
-    assert not params().output.with_name("head.part").exists()

@@ -64,15 +64,6 @@ def test_variants_are_drawn_from_seed_and_step(store, plan, monkeypatch):
     assert other.tolist() != whole[0].tolist()
 
 
-def test_variants_share_no_random_numbers_with_a_part(plan, monkeypatch):
-    monkeypatch.setattr(FeatureStore, "variants", 2**30)
-    found = plan(seed=5).step(3)[0].variants.tolist()
-    for part in range(8):
-        for entropy in ((5, 3), (5, 3, part), (5, 3, part, 0)):
-            rng = np.random.default_rng(entropy)
-            assert rng.integers(2**30, size=8).tolist() != found
-
-
 def test_accumulated_gradients_are_those_of_the_whole_batch(store, params, trainer, tmp_path):
     """Without dropout; ticks near an episode's end give the parts unequal weight."""
     still = {"expert": {"dim": 16, "layers": 1, "heads": 2, "dropout": 0.0}, "horizon": 12}

@@ -1,9 +1,7 @@
 """A training is never silent for long, and says how fast it goes and what it lacks."""
 
-import sys
 import time
 from dataclasses import replace
-from io import StringIO
 from typing import Any
 
 import numpy as np
@@ -30,13 +28,6 @@ class Waiting(Prefetch):
         self.waited_s = 0.0
 
 
-class Terminal(StringIO):
-    """What is written to it, which says that it is a terminal."""
-
-    def isatty(self) -> bool:
-        return True
-
-
 @pytest.fixture
 def clock(monkeypatch):
     """The time in s, which a test moves."""
@@ -58,17 +49,6 @@ def test_without_a_terminal_a_line_a_minute(clock, capsys):
         "step 112 of 200: train loss 0.2500, 0.2 steps/s, about 7.3 min left",
         "step 124 of 200: train loss 0.2500, 0.2 steps/s, about 6.3 min left",
     ]
-
-
-def test_on_a_terminal_a_bar_with_the_loss(store, params, trainer, clock, monkeypatch):
-    terminal = Terminal()
-    monkeypatch.setattr(sys, "stderr", terminal)
-    monkeypatch.setattr("pipeline.train.progress.EVERY_S", 0.0)
-    trainer(store, params(max_steps=12, eval_every=12)).fit()
-    shown = terminal.getvalue()
-    assert "12/12" in shown
-    assert "loss=" in shown.split("12/12")[0], "before the evaluation, too"
-    assert "train loss" not in shown
 
 
 def test_pauses_are_not_counted(monkeypatch, capsys):

@@ -104,15 +104,6 @@ def test_other_params_move_an_unfinished_run_aside(store, params, unfinished):
     assert decides["train_head"]["lr"] == 0.003
 
 
-def test_a_run_put_aside_gives_way_to_the_next(store, params, trainer, unfinished):
-    aside = unfinished.with_name("head.part-old")
-    shutil.copytree(unfinished, aside)
-    (aside / "run.json").write_text("older")
-    trainer(store, params(lr=0.5, max_steps=1)).fit()
-    decides = read_document(aside / "run.json", dict)[1]["decides"]
-    assert decides["train_head"]["lr"] == 0.003
-
-
 def test_nothing_is_written_before_the_params_are_known_to_be_good(
     store, params, trainer, unfinished
 ):
@@ -221,13 +212,6 @@ def test_the_advice_of_a_damaged_unfinished_run_leads_out(store, params, trainer
     assert "or remove its folder and run the training" in str(caught.value)
     shutil.rmtree((unfinished / file).parent)
     assert trainer(store, params()).run.status == "new"
-
-
-def test_a_run_without_a_checkpoint_refuses_no_other_store(store, params, tiny_store, tmp_path):
-    open_run(params(), store).begin()
-    other = FeatureStore.open(tiny_store(tmp_path, name="other", spec_digest="another"))
-    run = open_run(params(), other)
-    assert (run.status, run.notes) == ("new", ())
 
 
 def test_code_of_other_numbers_goes_on_with_no_run(store, params, unfinished, monkeypatch):

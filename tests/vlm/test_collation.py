@@ -2,6 +2,7 @@
 
 from contextlib import suppress
 
+import jaxtyping
 import numpy as np
 import pytest
 import torch
@@ -9,8 +10,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
+from pipeline.base.config import VLMParams
+from pipeline.base.digests import file_digest
 from pipeline.base.errors import VLMError
 from pipeline.vlm.collation import Collator, unique
+from pipeline.vlm.feature_spec import feature_spec
+from pipeline.vlm.preparation import Preparer
 from pipeline.vlm.qwen import FrozenVLM
 
 
@@ -64,23 +69,31 @@ def test_equal_images_of_a_batch_are_seen_once(extractor, make_frame, seen):
     torch.testing.assert_close(together, alone, atol=2e-5, rtol=1e-4)
 
 
-@pytest.mark.slow
-@pytest.mark.filterwarnings("ignore:`torch.jit.script_method`:DeprecationWarning")
-def test_a_compiled_model_gives_the_same_features_and_is_compiled_once_a_shape(
-    extractor, make_frame
-):
-    plain = extractor(pooling=["mean", "grid"], layers=[-1, 1], norms=[True, False])
-    compiled = FrozenVLM.load(plain.vlm, plain.spec, "cpu", compile=True)
-    frames = [{view: make_frame(7 * i + j) for j, view in enumerate(VIEWS)} for i in range(4)]
-    rows = [plain.preparer.prepare("insert the needle", one) for one in frames]
-    torch._dynamo.utils.counters.clear()
+def compare_with_compiled(vlm: VLMParams, frames: list[dict[str, np.ndarray]]) -> None:
+    spec = feature_spec(vlm, "float32", VIEWS, file_digest)
+    compiled, plain = (FrozenVLM.load(vlm, spec, "cpu", compile=how) for how in (True, False))
+    preparer = Preparer(vlm, spec)
+    rows = [preparer.prepare("insert the needle", one) for one in frames]
     for batch in (rows, rows[:1], rows[1:], [rows[0]] * 4):
         found, valid = compiled.encode(batch)
-        expected, expected_valid = plain.model.encode(batch)
+        expected, expected_valid = plain.encode(batch)
         torch.testing.assert_close(found, expected, atol=2e-5, rtol=1e-4)
         assert torch.equal(valid, expected_valid)
     assert torch._dynamo.utils.counters["stats"]["unique_graphs"] == 2
     assert not torch._dynamo.utils.counters["graph_break"]
+
+
+@pytest.mark.slow
+def test_a_compiled_model_gives_the_same_features_and_is_compiled_once_a_shape(
+    vlm_params, make_frame, fork_server
+):
+    """In a process without the checks of shapes, which the compiler cannot look into."""
+    vlm = vlm_params(pooling=["mean", "grid"], layers=[-1, 1], norms=[True, False])
+    frames = [{view: make_frame(7 * i + j) for j, view in enumerate(VIEWS)} for i in range(4)]
+    process = fork_server.Process(target=compare_with_compiled, args=(vlm, frames))
+    process.start()
+    process.join()
+    assert process.exitcode == 0
 
 
 @pytest.mark.filterwarnings("ignore:`torch.jit.script_method`:DeprecationWarning")
@@ -110,17 +123,26 @@ def test_a_compiled_model_is_given_sizes_that_it_has_seen_and_that_fit(
     assert given[7:] == [8, 4, 4], "what did not fit is not padded to again"
 
 
+@pytest.fixture
+def no_shape_checks():
+    """As the compiler cannot look into them."""
+    jaxtyping.config.update("jaxtyping_disable", True)
+    yield
+    jaxtyping.config.update("jaxtyping_disable", False)
+
+
 @pytest.mark.slow
+@pytest.mark.usefixtures("no_shape_checks")
 @pytest.mark.filterwarnings("ignore:`torch.jit.script_method`:DeprecationWarning")
 def test_no_compiler_is_said(extractor, make_frame, monkeypatch, tmp_path):
     from torch._inductor import config
 
-    monkeypatch.setattr(config.cpp, "cxx", (str(tmp_path / "no_compiler"),))
     monkeypatch.setenv("TORCHINDUCTOR_CACHE_DIR", str(tmp_path))
     plain = extractor(pooling=["mean"])
     compiled = FrozenVLM.load(plain.vlm, plain.spec, "cpu", compile=True)
     row = plain.preparer.prepare("insert the needle", {"View1": make_frame(0)})
-    with pytest.raises(VLMError, match=r"cannot be compiled here: .*set extract\.compile to false"):
+    refused = pytest.raises(VLMError, match=r"cannot be compiled here: .*set extract\.compile to")
+    with config.patch("cpp.cxx", (str(tmp_path / "no_compiler"),)), refused:
         compiled.encode([row])
 
 

@@ -11,7 +11,6 @@ import pytest
 import torch
 from peft import LoraConfig, PeftModel, get_peft_model
 from safetensors.torch import load_file, save_file
-from torch import Tensor
 from transformers import Qwen2_5_VLForConditionalGeneration
 
 from pipeline.base.config import VLMParams
@@ -23,8 +22,6 @@ from pipeline.vlm.processor import PixelSettings, PromptRenderer
 
 # peft 0.21 reads an attribute that transformers 5.23 calls deprecated.
 pytestmark = pytest.mark.filterwarnings("ignore:`is_gradient_checkpointing`:FutureWarning")
-
-Encode = Callable[..., Tensor]
 
 
 @pytest.fixture(scope="module")

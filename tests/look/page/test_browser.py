@@ -93,25 +93,3 @@ def test_without_scripts_and_on_paper_all_is_there(every_page, browser_page):
     # What is folded on a screen cannot be unfolded on paper.
     assert drawn.locator("details.outline pre").bounding_box()["height"] > 20
     assert drawn.pdf()[:5] == b"%PDF-"
-
-
-@pytest.mark.slow
-def test_the_contents_are_folded_on_a_phone_only(every_page: Path, browser_page) -> None:
-    assert browser_page(every_page).page.locator("nav a").first.is_visible()
-    phone = browser_page(every_page, (390, 844)).page
-    assert not phone.locator("nav a").first.is_visible()
-    phone.locator("nav summary").click()
-    phone.locator("nav a", has_text="Prompt").click()
-    assert phone.evaluate("() => location.hash") == "#prompt"
-    assert not phone.locator("nav a").first.is_visible()
-
-
-@pytest.mark.slow
-def test_the_contents_scroll_to_where_the_reader_is(tmp_path, browser_page):
-    said = [Section(f"Part {index}", [Text("word " * 2000)]) for index in range(60)]
-    page = browser_page(write_report(tmp_path, Report("Long", "", sections=said))[0]).page
-    page.evaluate("document.getElementById('part-50').scrollIntoView()")
-    here = page.locator("nav a[aria-current]", has_text="Part 50")
-    here.wait_for()
-    box = here.bounding_box()
-    assert 0 < box["y"] < 900

@@ -12,7 +12,7 @@ import pytest
 
 from pipeline.base.config import DataParams, Source
 from pipeline.base.errors import Issue
-from pipeline.data import Channels, Stream, open_recordings
+from pipeline.data import open_recordings
 from pipeline.data.timeline import choose_action_rotation
 from pipeline.look.page.style import RC
 from pipeline.look.recording.episode import LoadedRecording, view_episode
@@ -129,14 +129,3 @@ def change_csv() -> Callable[[Path, Callable[[np.ndarray], np.ndarray]], None]:
 def view(healthy: Path, look: Callable[..., LoadedRecording]) -> LoadedRecording:
     """A raw episode of three views, whose robot's clock has a gap, not to be changed."""
     return look(healthy / "raw")
-
-
-@pytest.fixture
-def felt(view: LoadedRecording) -> Callable[..., LoadedRecording]:
-    """`felt(names, units, time, values)`: that episode with this sensor, beginning at time 0."""
-
-    def build(names: Any, units: Any, time: np.ndarray, values: np.ndarray) -> LoadedRecording:
-        stream = Stream(Channels(tuple(names), tuple(units)), time, values.astype(np.float32))
-        return replace(view, sensor=stream, zero=0.0)
-
-    return build

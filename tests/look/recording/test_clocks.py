@@ -36,14 +36,6 @@ def test_stamps_in_bursts_are_no_gaps() -> None:
     assert gap.start_s == late[499]
 
 
-def test_whole_packets_with_one_stamp_have_a_rate() -> None:
-    time = np.repeat(np.arange(100) / 10, 65)
-    assert usual_step(time) == pytest.approx(1 / 650, rel=0.02)
-    assert gaps(time) == ()
-    (gap,) = gaps(np.delete(time, np.s_[650:975]))
-    assert gap.stop_s - gap.start_s == pytest.approx(0.6)
-
-
 FAST = np.arange(39000) / 650
 SLOW = np.arange(6000) / 100
 CAMERA = np.arange(600) / 10

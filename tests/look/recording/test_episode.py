@@ -1,6 +1,6 @@
 """What cannot be read is an issue; everything else is there all the same."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -75,13 +75,6 @@ def test_a_truncated_file_is_told_once(copied, look: Look) -> None:
         _ = view.recording.instruction
 
 
-def test_issues_count_time_from_the_first_instant(healthy: Path, look: Look) -> None:
-    view = look(healthy / "raw")
-    issue = view.issue("gap", "sensor", "", view.zero + 0.5, view.zero + 1)
-    assert view.zero > 1e9 and (issue.start_s, issue.stop_s) == (0.5, 1)
-    assert view.issue("gap", "sensor", "").start_s is None
-
-
 def test_streams_that_never_meet_leave_no_ticks(copied, look: Look, change_npz) -> None:
     folder = copied("raw")
     change_npz(only(folder, "sensor_data_*.npz"), timestamps=lambda time: time + 1000)
@@ -101,17 +94,3 @@ def test_a_view_that_cannot_be_decoded_is_left_out(copied, look: Look) -> None:
     (issue,) = find_issues(view)
     assert (issue.kind, issue.severity, issue.stream) == ("unreadable", "error", "view View2")
     assert "cannot be decoded" in issue.message
-
-
-def test_a_disk_that_fails_while_frames_are_read(copied, look, monkeypatch):
-    view = look(copied("raw"))
-    failing = view.cameras["View2"]
-
-    def read(indices: Sequence[int]) -> Iterator[np.ndarray]:
-        raise OSError("the disk is gone")
-
-    monkeypatch.setattr(failing, "read", read)
-    shown, (issue,) = read_frames(view, spread_ticks(view, 3))
-    assert set(shown) == {"View1", "View5"}
-    assert (issue.kind, issue.severity, issue.stream) == ("unreadable", "error", "view View2")
-    assert issue.message == "the disk is gone"

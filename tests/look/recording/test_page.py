@@ -7,8 +7,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import pyarrow as pa
-import pyarrow.parquet as pq
 import pytest
 
 from pipeline.base.config import Params, Source, load_params
@@ -83,20 +81,6 @@ def test_what_is_missing_is_said(recorded, params_of, tmp_path):
     assert folder.name in first.issues[0].episode
 
 
-def test_all_episodes_are_checked_and_some_are_shown(recorded, params_of, tmp_path):
-    (episode,) = recorded.iterdir()
-    for index in range(4):
-        shutil.copytree(episode, tmp_path / f"episode_{index}")
-    report = report_of(params_of(tmp_path, "inspect.episodes=2"))
-    table = next(report.blocks(Table))
-    assert [row[1] for row in table.rows] == [f"episode_{index}" for index in range(4)]
-    assert table.strong == {0, 3}
-    titles = [section.title for section in report.sections]
-    assert titles[2:4] == ["episode_0", "episode_3"]
-    names = [one.name for one in report.blocks(Picture)]
-    assert "episode1-episode_0-views" in names and "episode2-episode_3-views" in names
-
-
 def survey(*sources: Source, views: Sequence[str] | None = None, **data: Any) -> RecordingsOverview:
     document = {
         "data": {"sources": [source.model_dump() for source in sources], **data},
@@ -160,48 +144,6 @@ def test_episodes_that_cannot_be_opened(healthy: Path, tmp_path: Path) -> None:
     assert found.summaries[0].errors == 0
 
 
-def test_episodes_that_meta_lists_and_are_not_there(healthy: Path, tmp_path: Path) -> None:
-    root = Path(shutil.copytree(healthy / "lerobot", tmp_path / "lerobot"))
-    path = root / "meta/episodes/chunk-000/file-000.parquet"
-    (row,) = pq.ParquetFile(path).read().to_pylist()
-    other = {name: 1 if name.endswith("/file_index") else value for name, value in row.items()}
-    pq.write_table(pa.Table.from_pylist([row, {**other, "episode_index": 1}]), path)
-    (issue,) = survey(Source(name="s", path=str(root))).issues
-    assert (issue.kind, issue.severity, issue.source) == ("missing", "warning", "s")
-    assert "episode_000001" in issue.message
-
-
-def test_ticks_at_another_rate_than_the_recorded_rows(healthy: Path) -> None:
-    sources = [
-        Source(name="held", path=str(healthy / "lerobot"), action_kind="absolute"),
-        Source(name="poses", path=str(healthy / "raw")),
-    ]
-    recorded = (survey(*sources[:1], views=(), action_hz=hz).issues for hz in (10, None))
-    assert not any(issue.kind == "tick rate" for issues in recorded for issue in issues)
-    for action_hz, fate in ((5, "left out between ticks"), (20, "held")):
-        (issue,) = [
-            f
-            for f in survey(*sources, views=(), action_hz=action_hz).issues
-            if f.kind == "tick rate"
-        ]
-        assert (issue.severity, issue.source, issue.episode) == ("warning", "held", "")
-        assert f"ticks at {action_hz} Hz, recorded at 10 Hz: actions are {fate}" in issue.message
-
-
-def test_recordings_of_two_robots(healthy: Path, tmp_path: Path) -> None:
-    (episode,) = (healthy / "old" / "Red_point").iterdir()
-    other = Path(shutil.copytree(episode, tmp_path / "old" / "other"))
-    (other / "robot_states.npz").unlink()
-    # A velocity in the same channels is another kind of action.
-    sources = (
-        Source(name="one", path=str(episode)),
-        Source(name="two", path=str(other), action_kind="velocity"),
-    )
-    found = survey(*sources)
-    (issue,) = [issue for issue in found.issues if issue.kind == "embodiment"]
-    assert issue.severity == "error" and "'one'" in issue.message and "'two'" in issue.message
-
-
 def test_the_choice_spreads_over_sound_episodes(healthy: Path) -> None:
     (one,) = survey(Source(name="s", path=str(healthy / "old"))).summaries
     summaries = [replace(one, episode=str(place), issues=[]) for place in range(11)]
@@ -212,14 +154,3 @@ def test_the_choice_spreads_over_sound_episodes(healthy: Path) -> None:
         summaries[place].issues = issues
     assert found.choose(1) == (8,) and found.choose(2) == (3, 8)
     assert found.choose(5) == (0, 3, 7, 8, 10) and found.choose(99) == tuple(range(11))
-
-
-def test_a_view_that_most_episodes_have_is_missed(many: Path) -> None:
-    content = pickle.loads((many / "b" / "data.pkl").read_bytes())
-    view = max(content["image"])
-    del content["image"][view]
-    (many / "b" / "data.pkl").write_bytes(pickle.dumps(content))
-    (issue,) = survey(Source(name="s", path=str(many / "*"))).issues
-    assert (issue.severity, issue.kind, issue.episode) == ("warning", "missing", "b")
-    assert issue.stream.startswith("view ")
-    assert issue.message == "not there; most episodes of this source have it"

@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from matplotlib.figure import Figure
 
 from pipeline.base.config import Params, VLMParams
 from pipeline.base.errors import RecordingError, VLMError
@@ -18,7 +17,6 @@ from pipeline.look.recording.samples import (
     Sample,
     batch_table,
     cut_samples,
-    draw_samples,
     show_prompt,
     window_lengths,
 )
@@ -71,18 +69,6 @@ def test_samples_are_those_of_training(healthy: Path, look: Look, format: str) -
             assert np.array_equal(frame, batch.images[place][name])
 
 
-def test_samples_follow_the_seed_and_are_never_more_than_ticks(healthy: Path, look: Look) -> None:
-    view = look(healthy / "old")
-    assert view.timeline is not None
-
-    def ticks(samples: int, seed: int) -> list[int]:
-        return [sample.tick for sample in cut_samples(view, params_of(samples, seed))]
-
-    assert ticks(4, 1) == ticks(4, 1) != ticks(4, 2)
-    assert ticks(1, 0) == [0]
-    assert len(ticks(1000, 0)) == len(view.timeline.time)
-
-
 def test_of_an_episode_that_training_refuses_there_is_no_sample(copied, look):
     folder = copied("raw")
     next(folder.glob("sensor_data_*.npz")).write_bytes(b"no archive")
@@ -99,28 +85,6 @@ def params() -> Params:
 def samples(view: LoadedRecording, params: Params) -> list[Sample]:
     """The first tick, one within, and the last."""
     return cut_samples(view, params)
-
-
-@pytest.fixture
-def side_by_side(view: LoadedRecording, samples: list[Sample], params: Params) -> Figure:
-    return draw_samples(view, samples, window_lengths(params))
-
-
-def test_samples_have_a_column_each_and_say_what_they_reuse(view, samples, side_by_side):
-    # Three views, force, A-scan, state in deg and mm, action in mm, deg and gripper.
-    assert len(side_by_side.axes) == 3 * 10
-    tick, title = samples[1].tick, side_by_side.axes[1].get_title()
-    assert f"tick {tick} of" in title and f"VL row {tick // 3},\n{tick % 3} tick" in title
-
-
-def test_padding_and_masked_steps_are_hatched(samples: list[Sample], side_by_side: Figure) -> None:
-    force, gripper = side_by_side.axes[9:12], side_by_side.axes[27:30]
-    (padding,) = [one for one in force[0].patches if one.get_hatch()]
-    assert padding.get_width() == pytest.approx(65 - len(samples[0].windows["sensor"]))
-    assert not [one for one in force[1].patches if one.get_hatch()]
-    (masked,) = [one for one in gripper[2].patches if one.get_hatch()]
-    assert (masked.get_x(), masked.get_width()) == (1, 3)
-    assert not [one for one in gripper[1].patches if one.get_hatch()]
 
 
 def test_a_batch_tells_real_from_padded_and_masked(samples: list[Sample], params: Params) -> None:

@@ -43,17 +43,6 @@ def test_statistics_of_every_channel(healthy: Path, look: Look) -> None:
     assert rows["action", "dx"][6] == view.timeline.action[:, 0].max()
 
 
-def test_channels_that_differ_by_a_number_are_one_row(healthy: Path, look: Look) -> None:
-    names = ("force", *(f"aline_{depth:04d}" for depth in range(100)))
-    values = np.array([[5.0, *range(100)], [5.0, *range(1, 101)]], np.float32)
-    sensor = Stream(Channels(names, ("N",) * 101), np.arange(2.0), values)
-    view = replace(look(healthy / "raw"), sensor=sensor)
-    force, joint, *_ = table_of(view).rows
-    assert force[1] == "force"
-    assert joint[:4] == ("sensor", "aline_0000 … aline_0099 (100 channels)", "N", 2)
-    assert (joint[4], joint[8], joint[9]) == (0, 100, 50)
-
-
 SEEDS = (20, 23)
 
 
@@ -109,12 +98,6 @@ def test_contact_begins_where_the_force_rises_and_not_where_it_creeps(
     ((start, stop),) = contacts(view_of(base, time, force))
     assert start == pytest.approx(time[2000], abs=0.02)
     assert stop > time[2740]
-
-
-def test_contact_of_a_real_insertion_begins_with_the_rise(shared_data: Path, look) -> None:
-    view = look(shared_data / "insertion/raw")
-    ((start, stop),) = contacts(view)
-    assert 2.4 < start - view.zero < 2.6 and stop == view.sensor.time[-1]
 
 
 def test_wrenches_count_by_their_length(base: LoadedRecording) -> None:

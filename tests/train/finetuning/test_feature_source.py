@@ -226,23 +226,3 @@ def test_full_tuning_saves_a_checkpoint_to_extract_with(params, tmp_path):
 def test_a_gpu_that_is_too_small_ends_in_what_takes_less():
     with pytest.raises(ConfigError, match=r"finetune\.grad_accumulation"), out_of_memory_named():
         raise torch.cuda.OutOfMemoryError("tried to allocate 2.00 GiB")
-
-
-def test_what_is_not_used_of_a_store_is_said(params, tmp_path):
-    document = params().model_dump(mode="json")
-    document["vlm"]["variants"] = 2
-    document["extract"]["store"] = str(tmp_path / "variants.zarr")
-    given = Params.model_validate(document)
-    extract(given, say=lambda _: None)
-    store = FeatureStore.open(given.extract.store)
-    front = ModelFeatureSource(store, given, CPU)
-    assert any("1 augmented variant(s) of each row are not used" in s for s in front.summary())
-    draw = BatchIndices(np.arange(6), variants=np.ones(6, np.int64))
-    with front.feed([draw], Windows(2, 1, 1), CPU) as feed:
-        _, live = next(iter(feed))
-    with ModelFeatureSource(FeatureStore.open(params().extract.store), params(), CPU).feed(
-        [BatchIndices(np.arange(6))], Windows(2, 1, 1), CPU
-    ) as feed:
-        _, plain = next(iter(feed))
-    for one, other in zip(live.rows, plain.rows, strict=True):
-        assert np.array_equal(one.pixels, other.pixels)

@@ -3,7 +3,6 @@
 import pytest
 from pydantic import ValidationError
 
-from pipeline.base.errors import ConfigError
 from pipeline.train.finetuning import head_params
 
 
@@ -13,18 +12,6 @@ def test_finetune_is_laid_over_train_head(params):
     assert (head.batch_size, head.max_steps, head.eval_every) == (6, 5, 3)
     assert (head.output, head.logs) == (given.finetune.output, given.finetune.logs)
     assert (head.seed, head.drop_features, head.lr) == (3, 0.2, given.train_head.lr)
-
-
-@pytest.mark.parametrize(
-    ("section", "values", "said"),
-    [
-        ("finetune", {"tuning": {"method": "none"}}, "python -m stages.train_head"),
-        ("train_head", {"features_enabled": False}, "would not see the model that is tuned"),
-    ],
-)
-def test_what_cannot_be_tuned_is_refused(params, section, values, said):
-    with pytest.raises(ConfigError, match=said):
-        head_params(params(**{section: values}))
 
 
 @pytest.mark.parametrize(("section", "place"), [("finetune", "output"), ("train_head", "logs")])

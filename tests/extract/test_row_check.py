@@ -13,7 +13,6 @@ from pipeline.base.errors import StoreMismatch
 from pipeline.extract import extract
 from pipeline.extract.row_check import Reextraction, reextract
 from pipeline.store.schema import chunk_paths, read_spec
-from pipeline.vlm.qwen import FrozenVLM
 from pipeline.vlm.slots import TOLERANCES
 
 
@@ -111,17 +110,6 @@ class TestDeviations:
 
 
 class TestOtherThanTheStore:
-    def test_environments_are_compared(self, document, monkeypatch):
-        load = FrozenVLM.load.__func__
-
-        def elsewhere(cls, *args, **kwargs):
-            vlm = load(cls, *args, **kwargs)
-            vlm.environment = vlm.environment | {"torch": "99"}
-            return vlm
-
-        monkeypatch.setattr(FrozenVLM, "load", classmethod(elsewhere))
-        assert any('-> "99"' in line for line in again(document, rows=1).environment)
-
     def test_params_of_other_features_are_refused(self, document):
         document["vlm"] = document["vlm"] | {"prompt": "{images}"}
         with pytest.raises(StoreMismatch, match=r"other features.*\n  prompt"):

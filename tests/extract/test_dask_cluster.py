@@ -357,6 +357,7 @@ class TestRefusals:
 
 
 class TestScheduler:
+    @pytest.mark.slow
     def test_a_killed_scheduler_is_said_and_the_next_run_completes(
         self, changed, here, tmp_path, monkeypatch, begun
     ):
