@@ -2,10 +2,10 @@
 
 `head.onnx` is for ONNX Runtime, `head.pt2` for `torch.export.load`; `receipt.json` has their inputs
 and outputs, and how far each is from the policy. Normalisation is inside: physical units in and
-out. The inputs are the fields of `Observation` that the policy looks at and, where it samples, the
-standard normal `noise`, so that a file is a function; the sampler's loop is unrolled. The batch is
-of any size, windows are those of the params. Guides (`rtc`) differentiate the head, which neither
-format does.
+out. Features that the store keeps on a basis come in on it: `basis.npy`. The inputs are the fields
+of `Observation` that the policy looks at and, where it samples, the standard normal `noise`, so
+that a file is a function; the sampler's loop is unrolled. The batch is of any size, windows are
+those of the params. Guides (`rtc`) differentiate the head, which neither format does.
 """
 
 import json
@@ -35,7 +35,7 @@ from pipeline.policy.expert import Chunk
 from pipeline.policy.observation import AGES, VALIDITY
 from pipeline.policy.policy import Policy
 
-RECEIPT, CONTRACT = "receipt.json", "contract.json"
+RECEIPT, CONTRACT, BASIS = "receipt.json", "contract.json", "basis.npy"
 EXPORT = OutputKind("an exported head", lambda folder: (folder / RECEIPT).is_file())
 
 OPSET = 20
@@ -128,6 +128,8 @@ def export_head(
             say("translating it to ONNX")
             write_onnx(program, few, path := place / "head.onnx", contract)
             files[path.name] = _compare(path, onnx_runner(path), head, given, checkpoint)
+        if checkpoint.basis is not None:
+            np.save(place / BASIS, checkpoint.basis.maps)
         write_document(place / RECEIPT, contract | {"files": files})
 
     replace_folder(params.output, write, EXPORT)
@@ -169,6 +171,7 @@ def describe(checkpoint: PolicyCheckpoint, folder: str, given: Inputs) -> dict[s
         "units": action["units"],
         "kind": action["kind"],
     }
+    basis = f"{BASIS}: x @ maps[group, :-1] + maps[group, -1] of the model's x, a group a pooling"
     return {
         "checkpoint": folder,
         "step": checkpoint.step,
@@ -177,6 +180,7 @@ def describe(checkpoint: PolicyCheckpoint, folder: str, given: Inputs) -> dict[s
         "feature_spec_digest": checkpoint.source["feature_spec"]["digest"],
         "action_hz": checkpoint.source["action_hz"],
         "horizon": checkpoint.params.horizon,
+        "features_on": "the model's channels" if checkpoint.basis is None else basis,
         "inputs": [_input(checkpoint, name, value) for name, value in given.items()],
         "outputs": [outputs],
         "anchored": checkpoint.shape.anchored(action["names"]),

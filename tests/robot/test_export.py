@@ -19,6 +19,7 @@ from torch.export import ExportedProgram
 
 from pipeline.base.config import ExportParams, TrainHeadParams
 from pipeline.base.errors import ConfigError, NumericsError
+from pipeline.base.projection import Basis
 from pipeline.policy.checkpoint import PolicyCheckpoint
 from pipeline.policy.normalization import ChannelStatistics, Normalization
 from pipeline.policy.observation import PolicyShape
@@ -294,8 +295,10 @@ def test_golden_rows_are_judged_too(tmp_path) -> None:
         for _ in range(4)
     ]
     object.__setattr__(checkpoint, "golden", tuple(rows))
+    object.__setattr__(checkpoint, "basis", Basis(np.ones((1, 9, 8), np.float32)))
     (file,) = exported(tmp_path / "head", checkpoint, "torch")["files"].values()
     assert list(file["deviation"]) == ["random", "golden"]
+    assert np.load(tmp_path / "head" / "basis.npy").shape == (1, 9, 8)
     rows[0].features[0, 0] = np.nan
     with pytest.raises(NumericsError, match="found nan over golden inputs"):
         exported(tmp_path / "head", checkpoint, "torch")
