@@ -14,7 +14,7 @@ from benchmarks.formats import file_readers, row_readers, window_readers
 from benchmarks.timing import Race, Work, race
 from pipeline.store import FeatureStore
 from pipeline.store.gather import WIDE, Selection, Window
-from pipeline.store.mapping import populate
+from pipeline.store.memory_map import populate
 
 Index = NDArray[np.int64]
 CEILINGS = ("C gather from RAM: numpy take", "C gather from RAM: torch index_select")

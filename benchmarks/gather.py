@@ -40,7 +40,7 @@ from benchmarks.stores import write_store
 from benchmarks.timing import Race, Work, arguments, at_least, at_most, race, report
 from pipeline.store import FeatureStore
 from pipeline.store import gather as gathering
-from pipeline.store.mapping import populate
+from pipeline.store.memory_map import populate
 
 FULL = {
     "episodes": 40,

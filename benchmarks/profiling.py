@@ -19,7 +19,7 @@ from pipeline.vlm.qwen import Extractor
 from pipeline.vlm.vision import VisionTower
 
 _STEPS: tuple[tuple[str, Any, str], ...] = (
-    ("key", "pipeline.base.source", "row_key"),
+    ("key", "pipeline.base.provenance", "row_key"),
     ("resize", "pipeline.vlm.preparation", "stretch"),
     ("collate", Extractor, "collate"),
     ("patchify", "pipeline.vlm.qwen", "patchify"),

@@ -16,7 +16,7 @@ from pipeline.base.config import Params
 from pipeline.base.digests import ContentDigests
 from pipeline.data.episode import RowFrames, RowRange
 from pipeline.extract.engine import RANGE_ROWS
-from pipeline.extract.layout import build_arrays, lay_out
+from pipeline.extract.streams import build_arrays, lay_out
 from pipeline.extract.survey import CheckedEpisode, Survey, sound_episodes, survey
 from pipeline.simulation.demo_recordings import TASK
 from pipeline.simulation.insertion_formats import write_raw

@@ -27,7 +27,7 @@ from tqdm import tqdm
 
 from experiments.recipes import LARGE_IMAGES
 from pipeline.base.config import load_params
-from pipeline.base.machine import resolve_device
+from pipeline.base.hardware import resolve_device
 from pipeline.robot.live_features import LiveFeatures
 from pipeline.simulation.insertion import INSTRUCTION, NeedleInsertion
 from pipeline.simulation.rendering import VIEWS, photograph, through_jpeg

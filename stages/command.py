@@ -126,9 +126,9 @@ def _run(
     sections: Sequence[str],
 ) -> int:
     """Do what `run` does after it has parsed the options."""
-    from pipeline.base.commands import DEFAULT_PARAMS, running_with
     from pipeline.base.config import Params, described_keys, load_params
     from pipeline.base.errors import PipelineError
+    from pipeline.base.printed_commands import DEFAULT_PARAMS, running_with
 
     try:
         if options.keys:

@@ -28,8 +28,8 @@ SECTIONS = ("data", "vlm", "extract", "train_head")
 
 def main(params: "Params") -> None:
     """Print every group of issues; raise `PipelineError` if something is missing."""
-    from pipeline.base.commands import command
     from pipeline.base.errors import PipelineError
+    from pipeline.base.printed_commands import command
     from pipeline.look.doctor import describe, examine
 
     lacking: list[Issue] = []

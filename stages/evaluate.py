@@ -26,7 +26,7 @@ SHORTHANDS = short("evaluate", "--checkpoint", "--store", "--out", "--device")
 def main(params: "Params") -> None:
     """Evaluate the checkpoint that `evaluate` names, else what `train_head` wrote."""
     from pipeline.base.files import REPORT, refuse_foreign
-    from pipeline.base.machine import resolve_device
+    from pipeline.base.hardware import resolve_device
     from pipeline.evaluate.evaluation import evaluate_checkpoint
     from pipeline.evaluate.tables import ablation_text, error_text
     from pipeline.policy.checkpoint import find_policy, load_policy

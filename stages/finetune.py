@@ -29,7 +29,7 @@ SHORTHANDS = short("finetune", "--lr", "--steps", "--batch", "--out")
 
 def main(params: "Params") -> None:
     """Tune the model that `vlm` and `finetune` describe."""
-    from pipeline.base.machine import resolve_device
+    from pipeline.base.hardware import resolve_device
     from pipeline.store import FeatureStore
     from pipeline.train.finetuning import (
         ModelFeatureSource,

@@ -54,7 +54,7 @@ def main(params: "Params") -> None:
 
     subject = subject_of(params)
     if params.inspect.rerun:
-        from pipeline.look.scrubbing import write_episodes
+        from pipeline.look.rerun_files import write_episodes
 
         for folder in (params.inspect.output, subject.folder):
             claim(folder, REPORT)

@@ -65,7 +65,7 @@ def _write_nothing(folder: Path) -> None:
 
 def _here(params: "Params", say: Callable[[str], None]) -> "Rollouts":
     """The rollouts of a checkpoint, with the model in this process."""
-    from pipeline.base.machine import resolve_device
+    from pipeline.base.hardware import resolve_device
     from pipeline.evaluate.rollout_driver import roll_out
     from pipeline.policy.checkpoint import find_policy, load_policy
     from pipeline.robot.live_features import LiveFeatures

@@ -92,7 +92,7 @@ def _merge(params: "StoresParams") -> None:
 
 def _gc(params: "StoresParams") -> None:
     from pipeline.base.text import size
-    from pipeline.store.border import gc_command
+    from pipeline.store.documents import gc_command
     from pipeline.store.inventory import is_unneeded, leftover, list_stores, remove_leftover
 
     leftovers = [leftover(path) for path in params.inputs]

@@ -41,8 +41,8 @@ def main(params: "Params") -> None:
     """Check the store, and repair it or compute rows again if requested; raises on errors."""
     from pipeline.base.errors import NumericsError, StoreIncomplete
     from pipeline.base.text import capped
-    from pipeline.extract.reextract import reextract
-    from pipeline.store.border import mend
+    from pipeline.extract.row_check import reextract
+    from pipeline.store.documents import mend
     from pipeline.store.verification import verify
 
     if params.verify.checkpoint:
@@ -79,7 +79,7 @@ def _repair(store: Path, params: "Params") -> None:
 
 def _prove(params: "Params") -> None:
     """Compute the checkpoint's golden rows again, on the same device as `stages.serve`."""
-    from pipeline.base.machine import resolve_device
+    from pipeline.base.hardware import resolve_device
     from pipeline.policy.checkpoint import find_policy, load_policy
     from pipeline.robot.live_features import LiveFeatures, prove
 

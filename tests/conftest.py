@@ -81,7 +81,7 @@ from pipeline.simulation.insertion_formats import write_raw
 from pipeline.simulation.recorder import simulate_episode
 from pipeline.store import SCHEMA, FeatureStore, Sizes, StoreBuild, arrays, schema
 from pipeline.store.chunks import ChunkFiles, read_rows, row_checksums, write_seal
-from pipeline.store.golden import GoldenFrames, write_golden
+from pipeline.store.golden_rows import GoldenFrames, write_golden
 from pipeline.store.paths import read_attributes
 from pipeline.store.schema import read_specs
 
@@ -216,7 +216,7 @@ def fork_server() -> ForkServerContext:
     """Processes of a server that has imported what takes each seconds otherwise."""
     server = get_context("forkserver")
     stages = [f"stages.{name}" for name in ("evaluate", "extract", "store", "train_head")]
-    heavy = ["pipeline.extract.engine", "pipeline.extract.cluster", MODEL]
+    heavy = ["pipeline.extract.engine", "pipeline.extract.dask_cluster", MODEL]
     server.set_forkserver_preload([*stages, *heavy])
     forkserver.ensure_running()  # with these, whoever forks next
     return server

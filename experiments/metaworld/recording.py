@@ -18,10 +18,10 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from pipeline.base.border import Border, Document
+from pipeline.base.documents import Border, Document
 from pipeline.base.errors import ConfigError
 from pipeline.base.files import OutputKind, replace_folder, there, write_document
-from pipeline.data.lerobot_writer import LeRobotEpisode, write_data_set
+from pipeline.data.lerobot_writer import LeRobotRows, write_data_set
 from pipeline.simulation.meta_world import (
     ACTION,
     HZ,
@@ -69,7 +69,7 @@ class Demonstration(NamedTuple):
     """A finished episode; `rows` is None where the expert failed."""
 
     seed: int
-    rows: LeRobotEpisode | None
+    rows: LeRobotRows | None
 
 
 def seeds_of(purpose: Purpose, run: int) -> range:
@@ -114,7 +114,7 @@ def _record_set(
     def on_a_core(seed: int) -> Demonstration:
         return pool.submit(demonstrate, wanted, seed).result()
 
-    def kept() -> Iterator[LeRobotEpisode]:
+    def kept() -> Iterator[LeRobotRows]:
         tried = seeds_of("demonstrations", wanted.run)[: _TRIED * wanted.episodes]
         shown = in_background(tried, on_a_core, jobs)
         with closing(shown):
@@ -160,7 +160,7 @@ def demonstrate(wanted: Record, seed: int) -> Demonstration:
         "timestamp": (np.arange(len(states)) / HZ).astype(np.float32),
     }
     film = {f"observation.images.{VIEW}": np.stack(frames)}
-    return Demonstration(seed, LeRobotEpisode(columns, film) if environment.success else None)
+    return Demonstration(seed, LeRobotRows(columns, film) if environment.success else None)
 
 
 def recorded(out: Path, task: str) -> Record:

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
-from pipeline.base.border import Border
+from pipeline.base.documents import Border
 from pipeline.base.errors import ConfigError, DiskFull, PipelineError, RecordingError, StoreLocked
 from pipeline.base.files import described
 

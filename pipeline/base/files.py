@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from pydantic import JsonValue
 from safetensors import SafetensorError, safe_open
 
-from pipeline.base.border import MOST_WEIGHT, Border
+from pipeline.base.documents import MOST_WEIGHT, Border
 from pipeline.base.errors import CheckpointIncomplete, ConfigError, DiskFull
 
 if TYPE_CHECKING:

@@ -12,8 +12,8 @@ from numpy.lib import format as npy
 from numpy.typing import NDArray
 from pyarrow import csv as arrow_csv
 
-from pipeline.base.border import named, shown
 from pipeline.base.config import MediaLimits
+from pipeline.base.documents import named, shown
 from pipeline.base.errors import RecordingError
 from pipeline.data.recording import DEFAULT_LIMITS, RECORDINGS, check_unpacked
 

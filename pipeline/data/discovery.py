@@ -7,11 +7,11 @@ from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from pipeline.base.border import shown
-from pipeline.base.commands import command
 from pipeline.base.config import Source
+from pipeline.base.documents import shown
 from pipeline.base.errors import ConfigError, RecordingError
 from pipeline.base.hub import network_errors
+from pipeline.base.printed_commands import command
 from pipeline.data import lerobot, pickled, raw, windowed
 from pipeline.data.recording import Recording, absolute, entries, natural_key
 

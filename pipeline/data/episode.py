@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.base.border import named
+from pipeline.base.documents import named
 from pipeline.base.errors import RecordingError, StoreMismatch
 from pipeline.data.recording import CameraStream, Channels, Recording, Stream
 from pipeline.data.timeline import ActionRotation, Timeline, build_timeline, last_at

@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
 
-from pipeline.base.border import shown
 from pipeline.base.config import MediaLimits
+from pipeline.base.documents import shown
 from pipeline.base.errors import RecordingError
 from pipeline.data.recording import (
     DEFAULT_LIMITS,

@@ -18,8 +18,8 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from pipeline.base.border import Text, shown, uncollected
 from pipeline.base.config import MediaLimits, Source
+from pipeline.base.documents import Text, shown, uncollected
 from pipeline.base.errors import RecordingError
 from pipeline.data.arrays import matrix, member, read_npz
 from pipeline.data.insertion import SENSOR

@@ -16,10 +16,10 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import AliasChoices, BeforeValidator, Field, JsonValue, Strict, model_validator
 
-from pipeline.base.border import Border, Document, Text, shown
 from pipeline.base.config import MediaLimits
+from pipeline.base.documents import Border, Document, Text, shown
 from pipeline.base.errors import RecordingError
-from pipeline.base.source import is_view_name
+from pipeline.base.provenance import is_view_name
 from pipeline.data.lerobot_rows import ParquetTable
 from pipeline.data.recording import ActionKind, Grouped, natural_key
 from pipeline.data.video import VideoSpan, frame_count

@@ -16,8 +16,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from pipeline.base.border import shown
 from pipeline.base.config import MediaLimits
+from pipeline.base.documents import shown
 from pipeline.base.errors import RecordingError
 from pipeline.data.arrays import matrix
 from pipeline.data.jpeg import check_image, read_image

@@ -36,7 +36,7 @@ _IMAGE: Final = pa.struct(
 )
 
 
-class LeRobotEpisode(NamedTuple):
+class LeRobotRows(NamedTuple):
     """The rows of one episode and, by feature key, the frames of each camera."""
 
     columns: Columns
@@ -48,7 +48,7 @@ class LeRobotEpisode(NamedTuple):
 
 def write_data_set(
     root: Path,
-    episodes: Iterable[LeRobotEpisode],
+    episodes: Iterable[LeRobotRows],
     features: Features,
     task: str,
     fps: float,

@@ -18,10 +18,10 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import AfterValidator, BeforeValidator, InstanceOf, Strict
 
-from pipeline.base.border import Document, Text, shown
 from pipeline.base.config import Source
+from pipeline.base.documents import Document, Text, shown
 from pipeline.base.errors import RecordingError
-from pipeline.base.source import ViewName
+from pipeline.base.provenance import ViewName
 from pipeline.data.arrays import Numbers, numeric, read_npy
 from pipeline.data.insertion import (
     SENSOR,

@@ -23,11 +23,11 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from pipeline.base.arrays import first_non_finite, non_finite
-from pipeline.base.border import Border, Document, Text
 from pipeline.base.config import MediaLimits, Source
 from pipeline.base.digests import joint_digest
+from pipeline.base.documents import Border, Document, Text
 from pipeline.base.errors import RecordingError
-from pipeline.base.source import CLOCK_SLACK_S
+from pipeline.base.provenance import CLOCK_SLACK_S
 
 RECORDINGS = Border(RecordingError, "Copy or write the file again, or leave the episode out.")
 DEFAULT_LIMITS = MediaLimits()

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.base.errors import ConfigError, RecordingError
-from pipeline.base.source import RATE_TOLERANCE
+from pipeline.base.provenance import RATE_TOLERANCE
 from pipeline.data import Channels, RecordedAction, Recording, Stream
 
 ActionRotation = Literal["rotvec", "euler_delta"]

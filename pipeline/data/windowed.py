@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from pipeline.base.border import Text
 from pipeline.base.config import Source
+from pipeline.base.documents import Text
 from pipeline.base.errors import RecordingError
 from pipeline.data.arrays import Numbers, member, read_npz
 from pipeline.data.insertion import (

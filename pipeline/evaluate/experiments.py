@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import ConfigDict, Field, JsonValue
 
-from pipeline.base.border import Border, Document, Text
 from pipeline.base.config import FusionStrategy, ModelType
 from pipeline.base.differences import describe, differences
+from pipeline.base.documents import Border, Document, Text
 from pipeline.base.errors import ConfigError
 from pipeline.base.text import Table
 from pipeline.evaluate.baselines import BASELINES, METHODS

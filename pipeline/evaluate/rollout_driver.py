@@ -18,7 +18,6 @@ import torch
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from pipeline.base.commands import command
 from pipeline.base.config import (
     PHANTOM,
     RolloutAblation,
@@ -27,6 +26,7 @@ from pipeline.base.config import (
     latencies_ms,
 )
 from pipeline.base.errors import CheckpointMismatch, ConfigError
+from pipeline.base.printed_commands import command
 from pipeline.evaluate.rollouts import (
     EXPERT,
     POLICY,

@@ -1,7 +1,7 @@
 """Fill the missing rows of a build: from older stores if they have them, else with the model.
 
 `fill` is the coordinator's side. An executor computes the rows that no older store has:
-`compute_here` in this process, `pipeline.extract.cluster` on dask workers. In both cases a
+`compute_here` in this process, `pipeline.extract.dask_cluster` on dask workers. In both cases a
 `RowEngine` holds the model of a process.
 """
 

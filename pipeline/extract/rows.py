@@ -17,12 +17,12 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from pipeline.base.source import spread
+from pipeline.base.provenance import spread
 from pipeline.data.episode import Frames, RowFrames, RowRange
-from pipeline.extract.state import Say
+from pipeline.extract.build_state import Say
 from pipeline.extract.survey import Survey
 from pipeline.store import FEATURES, GoldenFrames, RowSource, StoreBuild
-from pipeline.store.golden import carried_golden
+from pipeline.store.golden_rows import carried_golden
 from pipeline.store.schema import KEYS
 from pipeline.vlm.preparation import PreparedRow, Preparer
 

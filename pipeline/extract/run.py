@@ -9,13 +9,10 @@ import numpy as np
 from pipeline.base.config import Params
 from pipeline.base.digests import ContentDigests, ledger_path
 from pipeline.base.errors import StoreMismatch
-from pipeline.base.machine import resolve_device
+from pipeline.base.hardware import resolve_device
 from pipeline.base.text import capped
 from pipeline.data.timeline import rate_notes
-from pipeline.extract.engine import Executor, ExtractionReport, compute_here, fill
-from pipeline.extract.layout import build_arrays, check_space, lay_out
-from pipeline.extract.rows import keep_golden
-from pipeline.extract.state import (
+from pipeline.extract.build_state import (
     BuildState,
     Say,
     StorePlaces,
@@ -23,6 +20,9 @@ from pipeline.extract.state import (
     plan_lines,
     row_sources,
 )
+from pipeline.extract.engine import Executor, ExtractionReport, compute_here, fill
+from pipeline.extract.rows import keep_golden
+from pipeline.extract.streams import build_arrays, check_space, lay_out
 from pipeline.extract.survey import (
     MOST_EPISODES,
     CheckedEpisode,
@@ -126,7 +126,7 @@ def _executor(surveyed: Survey) -> Executor:
     """The executor: this process, or the dask workers of `extract.workers`."""
     if surveyed.extract.workers == 0:
         return compute_here
-    from pipeline.extract.cluster import compute_on_cluster  # dask: a second to import
+    from pipeline.extract.dask_cluster import compute_on_cluster  # dask: a second to import
 
     return compute_on_cluster
 

@@ -16,17 +16,17 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
-from pipeline.base.border import Border
 from pipeline.base.config import DataParams, ExtractParams, Params, VLMParams
 from pipeline.base.digests import ContentDigests, joint_digest
+from pipeline.base.documents import Border
 from pipeline.base.errors import RecordingError, StoreMismatch, VLMError
-from pipeline.base.source import RATE_TOLERANCE, Streams
+from pipeline.base.provenance import RATE_TOLERANCE, Streams
 from pipeline.base.text import capped
 from pipeline.data import BadEpisode, Recording, content_digest, open_recordings
 from pipeline.data.episode import Embodiment, common_embodiment, read_episode
 from pipeline.data.recording import absolute
 from pipeline.data.timeline import ActionRotation, choose_action_rotation
-from pipeline.store.border import EpisodeText
+from pipeline.store.documents import EpisodeText
 from pipeline.store.episodes import EpisodeRows
 from pipeline.vlm.feature_spec import FeatureSpec, feature_spec
 from pipeline.vlm.preparation import Preparer

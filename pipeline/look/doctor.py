@@ -17,11 +17,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 from packaging.requirements import Requirement
 
-from pipeline.base.commands import command
 from pipeline.base.config import Params
 from pipeline.base.errors import ConfigError, Issue, PipelineError, RecordingError, VLMError
+from pipeline.base.hardware import available_bytes, memory_bytes, resolve_device
 from pipeline.base.hub import could_be_hub_id
-from pipeline.base.machine import available_bytes, memory_bytes, resolve_device
+from pipeline.base.printed_commands import command
 from pipeline.base.text import size
 
 if TYPE_CHECKING:

@@ -16,9 +16,9 @@ from tqdm import tqdm
 
 from pipeline.base.arrays import non_finite, widen
 from pipeline.base.channels import named
-from pipeline.base.commands import command
 from pipeline.base.config import InspectParams, setting
 from pipeline.base.errors import Issue, Severity, StoreIncomplete
+from pipeline.base.printed_commands import command
 from pipeline.base.text import Table, counted, duration, size
 from pipeline.look.page.blocks import (
     Block,
@@ -30,7 +30,7 @@ from pipeline.look.page.blocks import (
     next_steps,
 )
 from pipeline.store import FEATURES, KEY_BYTES, Episode, FeatureStore, check_trailers
-from pipeline.store.border import extract_command
+from pipeline.store.documents import extract_command
 from pipeline.store.gather import WIDE
 from pipeline.vlm.slots import slot_name
 

@@ -17,10 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, field_validator, model_validator
 
-from pipeline.base.border import Document, Text, shown
 from pipeline.base.config import TrainHeadParams
 from pipeline.base.config.section import Section
 from pipeline.base.differences import describe, differences
+from pipeline.base.documents import Document, Text, shown
 from pipeline.base.errors import CheckpointIncomplete, CheckpointMismatch, PipelineError
 from pipeline.base.files import (
     RUN_FILES,
@@ -32,13 +32,13 @@ from pipeline.base.files import (
     write_tensors,
     write_with_digest,
 )
-from pipeline.base.source import (
+from pipeline.base.provenance import (
     MOST_GOLDEN,
     SIDES,
-    EpisodePart,
     GoldenRow,
     Side,
     SourceDocument,
+    SplitPart,
     row_key,
 )
 from pipeline.policy.normalization import ChannelStatistics, Normalization
@@ -115,7 +115,7 @@ class PolicyDocument(SourceDocument):
     params: PolicyParams
     shape: PolicyShape
     instructions: Annotated[tuple[Text, ...], Field(max_length=MOST)] = ()
-    split: dict[Side, dict[Text, EpisodePart]]
+    split: dict[Side, dict[Text, SplitPart]]
     weights_sha256: Sha256
     normalization: Normalization
     golden: GoldenDocument | None = None
@@ -187,7 +187,7 @@ class PolicyCheckpoint:
     normalization: Normalization
     source: Mapping[str, Any]
     """Of the store: `feature_spec`, `streams`, `action_hz`, `vlm_reuse_count`."""
-    split: Mapping[Side, Mapping[str, EpisodePart]]
+    split: Mapping[Side, Mapping[str, SplitPart]]
     """The episodes by "source/id": trained on (`train`), chosen on (`val`), never seen (`test`)."""
     step: int
     weights: Mapping[str, "Tensor"]

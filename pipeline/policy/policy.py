@@ -12,7 +12,7 @@ from pipeline.base.config import TrainHeadParams
 from pipeline.base.errors import ObservationError
 from pipeline.base.observation import Observation
 from pipeline.base.packing import unpack
-from pipeline.base.source import CLOCK_SLACK_S
+from pipeline.base.provenance import CLOCK_SLACK_S
 from pipeline.policy.diffusion import DiffusionActionExpert
 from pipeline.policy.encoders import build_encoders
 from pipeline.policy.expert import (

@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import ConfigDict, Field
 
-from pipeline.base.border import Text
+from pipeline.base.documents import Text
 from pipeline.base.errors import ConfigError
 
 MOST = 1_000_000

@@ -12,15 +12,15 @@ from typing import Any
 from pydantic import TypeAdapter, ValidationError
 from tqdm import tqdm
 
-from pipeline.base.border import problems
 from pipeline.base.config import DriveParams, Params
+from pipeline.base.documents import problems
 from pipeline.base.errors import ConfigError, RobotStopped
-from pipeline.base.named import make_named
+from pipeline.base.user_classes import make_named
 from pipeline.robot.client import TOKEN_VARIABLE, PolicyClient, refuse_other_robot
 from pipeline.robot.lerobot_arm import LeRobotArm
 from pipeline.robot.limits import Limits
 from pipeline.robot.loop import StopKind, check_chunking
-from pipeline.robot.process import ended_by_hand
+from pipeline.robot.loop_process import ended_by_hand
 from pipeline.robot.realtime import PolicySession, Robot, RunSettings, run_robot
 from pipeline.robot.recorder import RunRecorder
 from pipeline.robot.run_report import RunReport

@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from pipeline.base.arrays import array_of, code_size, widen
-from pipeline.base.commands import command
 from pipeline.base.config import TuningParams, VLMParams
 from pipeline.base.errors import CheckpointMismatch
 from pipeline.base.packing import pack
-from pipeline.base.source import row_key
+from pipeline.base.printed_commands import command
+from pipeline.base.provenance import row_key
 from pipeline.base.text import capped
 from pipeline.policy.checkpoint import PolicyCheckpoint
 from pipeline.vlm.live import LiveVLM, live_spec, refuse_other_features

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from pipeline.base.arrays import first_non_finite
 from pipeline.base.errors import ConfigError, ObservationError
-from pipeline.base.source import CLOCK_SLACK_S
+from pipeline.base.provenance import CLOCK_SLACK_S
 from pipeline.robot.loop import PlanGuide
 
 LONGEST_PROMPT: Final = 1000

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.base.source import CLOCK_SLACK_S
+from pipeline.base.provenance import CLOCK_SLACK_S
 from pipeline.robot.loop import SafeStop, StopKind
 
 if TYPE_CHECKING:

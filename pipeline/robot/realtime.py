@@ -29,7 +29,13 @@ from pipeline.base.config import Chunking
 from pipeline.base.errors import ConfigError
 from pipeline.robot.limits import Limits
 from pipeline.robot.loop import ControlLoop, Executor, SafeStop, StopKind
-from pipeline.robot.process import PolicyThread, Watchdog, ended_by_hand, stop_firmly, undisturbed
+from pipeline.robot.loop_process import (
+    PolicyThread,
+    Watchdog,
+    ended_by_hand,
+    stop_firmly,
+    undisturbed,
+)
 from pipeline.robot.readings import PendingReadings, RobotClock
 from pipeline.robot.run_report import (
     ANSWER_PARTS,

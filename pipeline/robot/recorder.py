@@ -32,7 +32,7 @@ from numpy.typing import ArrayLike, NDArray
 from pydantic import ConfigDict
 
 from pipeline.base.arrays import non_finite
-from pipeline.base.border import Document, Text
+from pipeline.base.documents import Document, Text
 from pipeline.base.errors import DiskFull, RecordingError
 from pipeline.base.files import (
     FULL,
@@ -44,7 +44,7 @@ from pipeline.base.files import (
     write_document,
 )
 from pipeline.data.lerobot import ACTION, STATE
-from pipeline.data.lerobot_writer import LeRobotEpisode, write_data_set, write_sidecar
+from pipeline.data.lerobot_writer import LeRobotRows, write_data_set, write_sidecar
 from pipeline.data.recording import RECORDINGS
 
 RUN: Final = "run.json"
@@ -387,5 +387,5 @@ def _write_rows(
     digest = np.array([str(metadata.get("feature_spec_digest", ""))])
     used = {"key": rows["key"], "age_s": rows["age_s"]}
     write_sidecar(root, "features", used | {"feature_spec_digest": digest})
-    episode = LeRobotEpisode(columns, images=images)
+    episode = LeRobotRows(columns, images=images)
     write_data_set(root, [episode], features, run.instruction, metadata["action_hz"])

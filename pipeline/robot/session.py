@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from pipeline.base.config import VLMParams
 from pipeline.base.errors import CheckpointMismatch, NumericsError, ObservationError
-from pipeline.base.machine import resolve_device
+from pipeline.base.hardware import resolve_device
 from pipeline.policy.checkpoint import PolicyCheckpoint, find_policy, load_policy
 from pipeline.policy.expert import Guide
 from pipeline.policy.observation import moving_channels

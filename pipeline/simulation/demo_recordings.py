@@ -20,8 +20,8 @@ import numpy as np
 from tqdm import tqdm
 
 from pipeline.base import files
-from pipeline.base.border import Border, Document, Text
 from pipeline.base.digests import joint_digest
+from pipeline.base.documents import Border, Document, Text
 from pipeline.base.errors import ConfigError
 from pipeline.base.files import OutputKind, recover_folder, replace_folder, write_document
 from pipeline.simulation.insertion_formats import (
@@ -32,7 +32,7 @@ from pipeline.simulation.insertion_formats import (
     write_old,
     write_raw,
 )
-from pipeline.simulation.recorder import SimulatedEpisode, simulate_episode
+from pipeline.simulation.recorder import Demonstration, simulate_episode
 
 DEMO_VERSION: Final = 2
 """Raise it whenever the same seed gives other recordings."""
@@ -59,7 +59,7 @@ class _Marker(Document):
     """`contents_digest` of the folder when it was written."""
 
 
-Episodes = Iterator[SimulatedEpisode]
+Episodes = Iterator[Demonstration]
 Write = Callable[[Path, Episodes], None]
 
 
@@ -145,7 +145,7 @@ def _simulated(
 
 
 def _write_episodes(
-    write: Callable[[Path, SimulatedEpisode], None], folder: Path, episodes: Episodes
+    write: Callable[[Path, Demonstration], None], folder: Path, episodes: Episodes
 ) -> None:
     for episode in episodes:
         write(folder / TASK, episode)

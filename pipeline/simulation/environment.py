@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from pipeline.base.config import PHANTOM, Level
 from pipeline.base.errors import ConfigError
-from pipeline.base.named import make_named
+from pipeline.base.user_classes import make_named
 from pipeline.data.insertion import SENSOR, STATE
 from pipeline.data.timeline import ActionRotation, pose_channels
 from pipeline.simulation.insertion import (

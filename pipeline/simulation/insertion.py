@@ -34,8 +34,8 @@ from numpy.typing import NDArray
 from pipeline.base.config import Level
 from pipeline.data.timeline import ActionRotation, wrapped_deg
 from pipeline.simulation.arm import ArmMotion, angles_deg, moved, orientation, robot_state
-from pipeline.simulation.expert import REACTION_TICKS, expert_motion
-from pipeline.simulation.layout import InsertionLayout, draw_layout
+from pipeline.simulation.demonstrator import REACTION_TICKS, expert_motion
+from pipeline.simulation.insertion_layout import InsertionLayout, draw_layout
 from pipeline.simulation.needle_sensor import READING_HZ, NeedleContact, NeedleSensor
 
 TICK_HZ: Final = 10

@@ -18,12 +18,12 @@ from PIL import Image
 from pipeline.data.insertion import CLOCK, SENSOR, STATE
 from pipeline.data.lerobot import ACTION as ACTION_KEY
 from pipeline.data.lerobot import STATE as STATE_KEY
-from pipeline.data.lerobot_writer import LeRobotEpisode, write_data_set, write_sidecar
+from pipeline.data.lerobot_writer import LeRobotRows, write_data_set, write_sidecar
 from pipeline.data.pickled import ACTION
 from pipeline.simulation.arm import euler_actions
 from pipeline.simulation.insertion import INSTRUCTION, STATE_HZ, TICK_HZ, TICK_S
 from pipeline.simulation.needle_sensor import READING_HZ
-from pipeline.simulation.recorder import SimulatedEpisode
+from pipeline.simulation.recorder import Demonstration
 from pipeline.simulation.rendering import JPEG_QUALITY, VIEWS
 
 ABUTTING, OVERLAPPING = (65, 65), (650, 130)
@@ -38,7 +38,7 @@ _MADE_UP_MACHINE = "/mnt/robot/dataset"
 _GAP_ROWS = 5
 
 
-def write_raw(task: Path, episode: SimulatedEpisode) -> None:
+def write_raw(task: Path, episode: Demonstration) -> None:
     """Write `data_collection_<stamp>/`: every stream with its clock; the robot's has a gap."""
     folder = task / f"data_collection_{episode.stamp}"
     folder.mkdir(parents=True)
@@ -60,7 +60,7 @@ def write_raw(task: Path, episode: SimulatedEpisode) -> None:
 
 
 def write_new(
-    task: Path, episode: SimulatedEpisode, windows: tuple[int, int], robot_clock: bool
+    task: Path, episode: Demonstration, windows: tuple[int, int], robot_clock: bool
 ) -> None:
     """Write `episode_<stamp>/`: sensor windows (length, stride), no actions.
 
@@ -102,7 +102,7 @@ def write_new(
     (folder / "metadata.json").write_text(json.dumps(metadata, indent=2), encoding="utf-8")
 
 
-def write_old(task: Path, episode: SimulatedEpisode) -> None:
+def write_old(task: Path, episode: Demonstration) -> None:
     """Write `recv_all_<stamp>/`: actions and sensor at 10 Hz in a pickle, without a clock."""
     folder = task / f"recv_all_{episode.stamp}"
     # Rows count from the time in the earliest frame's name, so the first camera begins with them.
@@ -142,7 +142,7 @@ def write_old(task: Path, episode: SimulatedEpisode) -> None:
     (folder / "data.pkl").write_bytes(pickle.dumps(document, protocol=4))
 
 
-def write_lerobot(root: Path, episodes: Iterable[SimulatedEpisode]) -> None:
+def write_lerobot(root: Path, episodes: Iterable[Demonstration]) -> None:
     """Write a LeRobot v3.0 data set, with the sensor in sidecars; episodes are taken one at a time.
 
     Rows are on LeRobot's own clock, k / fps from the first. The sidecars' times are on that clock
@@ -156,7 +156,7 @@ def write_lerobot(root: Path, episodes: Iterable[SimulatedEpisode]) -> None:
     write_data_set(root, rows, features, INSTRUCTION, TICK_HZ, "simulated_meca500")
 
 
-def _lerobot_rows(root: Path, episodes: Iterable[SimulatedEpisode]) -> Iterator[LeRobotEpisode]:
+def _lerobot_rows(root: Path, episodes: Iterable[Demonstration]) -> Iterator[LeRobotRows]:
     """The rows of each episode, after its sidecar is written."""
     for index, episode in enumerate(episodes):
         begin = episode.epoch_s + TICK_S
@@ -178,10 +178,10 @@ def _lerobot_rows(root: Path, episodes: Iterable[SimulatedEpisode]) -> Iterator[
             f"observation.images.{view}": np.stack([*episode.frames(view, time[:-1])])
             for view in VIEWS
         }
-        yield LeRobotEpisode(columns, frames)
+        yield LeRobotRows(columns, frames)
 
 
-def _write_state_csv(path: Path, episode: SimulatedEpisode, time: NDArray[np.float64]) -> None:
+def _write_state_csv(path: Path, episode: Demonstration, time: NDArray[np.float64]) -> None:
     header = ("recv_timestamp", CLOCK, "send_timestamp", "force_placeholder", *STATE.names)
     clocks = [time + 0.004, time, time + 0.002, np.zeros(len(time))]
     table = np.column_stack([*clocks, episode.states(time)])
@@ -190,7 +190,7 @@ def _write_state_csv(path: Path, episode: SimulatedEpisode, time: NDArray[np.flo
 
 
 def _write_frames(
-    folder: Path, prefix: str, episode: SimulatedEpisode, view: str, clock: NDArray[np.float64]
+    folder: Path, prefix: str, episode: Demonstration, view: str, clock: NDArray[np.float64]
 ) -> list[str]:
     """The names of the JPEGs written, in the clock's order."""
     folder.mkdir(parents=True)

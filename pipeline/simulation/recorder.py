@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from pipeline.simulation.arm import robot_state
 from pipeline.simulation.insertion import ENCODER_NOISE, INSERTED, STATE_HZ, NeedleInsertion
-from pipeline.simulation.layout import WORKSPACE_MM, InsertionLayout, draw_layout
+from pipeline.simulation.insertion_layout import WORKSPACE_MM, InsertionLayout, draw_layout
 from pipeline.simulation.needle_sensor import READING_HZ
 from pipeline.simulation.rendering import photograph
 
@@ -34,7 +34,7 @@ distance by which a nudge moves the target."""
 
 
 @dataclass(frozen=True)
-class SimulatedEpisode:
+class Demonstration:
     """One finished episode that began at `epoch_s`, and the generator of its clocks' jitter.
 
     `sensor` (reading, 1026) is at 650 Hz; the first reading is 1/650 s after the beginning.
@@ -92,7 +92,7 @@ class SimulatedEpisode:
             yield photograph(view, self.insertion, float(instant) - self.epoch_s)
 
 
-def simulate_episode(seed: int, epoch_s: float, crosses_180: bool = False) -> SimulatedEpisode:
+def simulate_episode(seed: int, epoch_s: float, crosses_180: bool = False) -> Demonstration:
     """A demonstration that succeeds, of this seed or of the next seed with one.
 
     Disturbances of the demonstrator put recoveries into the data, as in Laskey et al. 2017, "DART:
@@ -114,7 +114,7 @@ def simulate_episode(seed: int, epoch_s: float, crosses_180: bool = False) -> Si
     if insertion.outcome != INSERTED:
         return simulate_episode(seed + 1, epoch_s, crosses_180)
     rng = np.random.default_rng([seed, 201])
-    return SimulatedEpisode(insertion, np.concatenate(readings), epoch_s, rng)
+    return Demonstration(insertion, np.concatenate(readings), epoch_s, rng)
 
 
 def _nudged(layout: InsertionLayout, rng: np.random.Generator) -> InsertionLayout:

@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING, Any
 
 from pipeline.store.chunks import check_trailers
 from pipeline.store.episodes import Episode
-from pipeline.store.golden import GoldenFrames
+from pipeline.store.golden_rows import GoldenFrames
+from pipeline.store.known_rows import RowSource
 from pipeline.store.lock import build_lock
 from pipeline.store.paths import part_path, read_plan, recover
 from pipeline.store.reader import FeatureStore, episode_name, place
-from pipeline.store.row_source import RowSource
 from pipeline.store.schema import FEATURES, KEY_BYTES, SCHEMA, Sizes, arrays
 from pipeline.store.writer import StoreBuild
 

@@ -26,7 +26,7 @@ from tqdm import tqdm
 from zarr.codecs import BloscCodec, BloscShuffle, Crc32cCodec
 from zarr.storage import LocalStore, StorePath
 
-from pipeline.base.border import Border, Document
+from pipeline.base.documents import Border, Document
 from pipeline.base.errors import PipelineError, StoreIncomplete, StoreMismatch
 from pipeline.base.files import (
     OutputKind,
@@ -37,7 +37,8 @@ from pipeline.base.files import (
     remove_folder,
     sync,
 )
-from pipeline.store.border import (
+from pipeline.store.chunks import METADATA_DIGEST, SEAL, check_seal, check_trailers, read_rows
+from pipeline.store.documents import (
     Group,
     StoreAttributes,
     extract_command,
@@ -45,8 +46,7 @@ from pipeline.store.border import (
     mend,
     store_border,
 )
-from pipeline.store.chunks import METADATA_DIGEST, SEAL, check_seal, check_trailers, read_rows
-from pipeline.store.golden import golden_places, read_golden
+from pipeline.store.golden_rows import golden_places, read_golden
 from pipeline.store.lock import build_lock
 from pipeline.store.paths import STORE, group_attributes, part_path, recover, unfinished_plans
 from pipeline.store.paths import put_in_place as put_store_in_place

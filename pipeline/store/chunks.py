@@ -21,10 +21,10 @@ import zarr
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from pipeline.base.border import shown
+from pipeline.base.documents import shown
 from pipeline.base.errors import StoreIncomplete
 from pipeline.base.files import disk_full_named
-from pipeline.store.border import mend, store_border
+from pipeline.store.documents import mend, store_border
 from pipeline.store.paths import group_attributes, laid_out_attributes
 from pipeline.store.schema import (
     ARRAY_NAMES,

@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.base.border import shown
-from pipeline.store.border import EpisodeText, store_border
+from pipeline.base.documents import shown
+from pipeline.store.documents import EpisodeText, store_border
 from pipeline.store.schema import POSITIONS, STREAMS
 
 FIELDS = tuple(name for name in EpisodeText.model_fields if name != "group")

@@ -14,11 +14,11 @@ from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 from torch import Tensor
 
-from pipeline.base.machine import available_bytes
+from pipeline.base.hardware import available_bytes
 from pipeline.base.observation import Observation
-from pipeline.base.source import CLOCK_SLACK_S
+from pipeline.base.provenance import CLOCK_SLACK_S
 from pipeline.store.episodes import episode_of
-from pipeline.store.mapping import fitting, populate, read_at_random, will_need
+from pipeline.store.memory_map import fitting, populate, read_at_random, will_need
 
 WIDE = {
     "action": "tick/action",

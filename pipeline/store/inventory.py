@@ -14,13 +14,13 @@ from pathlib import Path
 import numpy as np
 
 from pipeline.base.arrays import packed_dim
-from pipeline.base.commands import command
 from pipeline.base.errors import ConfigError, PipelineError, StoreLocked
 from pipeline.base.files import remove_folder
+from pipeline.base.printed_commands import command
 from pipeline.base.text import Table, size
 from pipeline.store.archive import is_archive, read_manifest
-from pipeline.store.border import StoreAttributes
 from pipeline.store.chunks import read_rows
+from pipeline.store.documents import StoreAttributes
 from pipeline.store.lock import build_lock, is_locked
 from pipeline.store.paths import (
     KEPT,

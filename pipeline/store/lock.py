@@ -10,7 +10,7 @@ from collections.abc import Generator
 from contextlib import contextmanager
 from pathlib import Path
 
-from pipeline.base.border import Border
+from pipeline.base.documents import Border
 from pipeline.base.errors import ConfigError, StoreLocked
 from pipeline.base.files import there
 

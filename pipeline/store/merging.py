@@ -19,10 +19,10 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from pipeline.base.commands import command
 from pipeline.base.differences import describe, differences
 from pipeline.base.errors import ConfigError, StoreMismatch
-from pipeline.base.source import (
+from pipeline.base.printed_commands import command
+from pipeline.base.provenance import (
     RATE_TOLERANCE,
     join_tuned_on,
     spread,
@@ -37,7 +37,7 @@ from pipeline.store.chunks import (
     read_rows,
 )
 from pipeline.store.episodes import Episode, index_arrays
-from pipeline.store.golden import GOLDEN, GoldenFrames, read_golden
+from pipeline.store.golden_rows import GOLDEN, GoldenFrames, read_golden
 from pipeline.store.lock import build_lock
 from pipeline.store.paths import (
     MERGED,
@@ -68,7 +68,7 @@ _NOT_TAKEN = (METADATA_DIGEST, SEAL, GOLDEN)
 
 
 @dataclass(frozen=True)
-class EpisodeRun:
+class ConsecutiveRows:
     """Episodes that follow one another both in an input and in the merged store.
 
     For each stream, `rows` has their rows in the input, and `shift` what is added to row numbers in
@@ -91,7 +91,7 @@ class EpisodeRun:
             yield block, read_rows(self.store.path, spec, block.start, block.stop)
 
 
-class MergedEpisodes:
+class MergedIndex:
     """The episodes of several stores one after the other; those of equal digest only once.
 
     Different episodes of the same name, such as from two places that both call a source `lab`, get
@@ -121,7 +121,7 @@ class MergedEpisodes:
         self.arrays = index_arrays(self.episodes, self.sources)
         self.runs = [*self._runs(taken)]
 
-    def _runs(self, taken: Sequence[tuple[FeatureStore, Episode]]) -> Iterator[EpisodeRun]:
+    def _runs(self, taken: Sequence[tuple[FeatureStore, Episode]]) -> Iterator[ConsecutiveRows]:
         """The episodes in runs, as long as possible."""
         numbered = ((store, episode, at) for at, (store, episode) in enumerate(taken))
         for _, group in groupby(numbered, lambda it: (it[0].path, it[1].index - it[2])):
@@ -135,7 +135,7 @@ class MergedEpisodes:
                 name: int(self.arrays[f"episode/{name}_start"][begin]) - inside.start
                 for name, inside in rows.items()
             }
-            yield EpisodeRun(store, rows, shift)
+            yield ConsecutiveRows(store, rows, shift)
 
     @property
     def plan(self) -> str:
@@ -169,7 +169,7 @@ class MergedEpisodes:
         return int(self.arrays[f"episode/{stream}_start"][-1])
 
 
-def merge(inputs: Sequence[Path], output: Path | None) -> MergedEpisodes | None:
+def merge(inputs: Sequence[Path], output: Path | None) -> MergedIndex | None:
     """Make `output` from the episodes of all inputs, in order; None if it already is that store.
 
     An episode in several inputs (equal digest) is taken once, from the first. Memory stays bounded;
@@ -185,7 +185,7 @@ def merge(inputs: Sequence[Path], output: Path | None) -> MergedEpisodes | None:
         stores = [FeatureStore.open(path) for path in inputs]
         inodes = [path.stat().st_ino for path in inputs]
         _check_alike(stores)
-        merged = MergedEpisodes(stores)
+        merged = MergedIndex(stores)
         plan = merged.plan
         if read_plan(output) == plan:
             FeatureStore.open(output)  # refuses a store that changed after sealing
@@ -278,7 +278,7 @@ def _has(store: FeatureStore, stream: str) -> bool:
     return stream not in ("sensor", "state") or store.array(f"{stream}/values").shape[1] > 0
 
 
-def _copy(build: StoreBuild, merged: MergedEpisodes) -> None:
+def _copy(build: StoreBuild, merged: MergedIndex) -> None:
     """Write everything; link whole chunks at the start of the first input.
 
     Raises `StoreIncomplete`, which names a feature row that does not give its checksum.
@@ -313,7 +313,7 @@ def _copy(build: StoreBuild, merged: MergedEpisodes) -> None:
     build.finish_layout(attrs | its_own | tuned_on_attributes(tuned), of_vl)
 
 
-def _environment(merged: MergedEpisodes) -> list[dict[str, Any]]:
+def _environment(merged: MergedIndex) -> list[dict[str, Any]]:
     """The software and hardware that computed each range of rows."""
     ranges: list[dict[str, Any]] = []
     for run in merged.runs:
@@ -326,7 +326,7 @@ def _environment(merged: MergedEpisodes) -> list[dict[str, Any]]:
     return ranges
 
 
-def _golden(merged: MergedEpisodes) -> list[GoldenFrames]:
+def _golden(merged: MergedIndex) -> list[GoldenFrames]:
     """Golden rows of the merged store, chosen from those of the inputs, which are checked again."""
     inputs = {store.path: read_golden(store.path, store.array(KEYS)) for store in merged.stores}
     known = [

@@ -30,7 +30,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.base import files
-from pipeline.base.border import Border, shown
+from pipeline.base.documents import Border, shown
 from pipeline.base.errors import ConfigError, StoreIncomplete, StoreMismatch
 from pipeline.base.files import (
     OutputKind,
@@ -42,7 +42,7 @@ from pipeline.base.files import (
     there,
     unmark,
 )
-from pipeline.store.border import (
+from pipeline.store.documents import (
     KNOWN,
     Group,
     StoreAttributes,

@@ -15,11 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.base.arrays import dim_of, widen
-from pipeline.base.source import GoldenRow
+from pipeline.base.provenance import GoldenRow
 from pipeline.store.chunks import check_seal
 from pipeline.store.episodes import Episode, check_index, check_positions, episode_of, read_episodes
-from pipeline.store.golden import GoldenFrames, read_golden
-from pipeline.store.mapping import map_flat
+from pipeline.store.golden_rows import GoldenFrames, read_golden
+from pipeline.store.memory_map import map_flat
 from pipeline.store.paths import read_attributes
 from pipeline.store.schema import (
     FEATURES,

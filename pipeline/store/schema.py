@@ -18,9 +18,9 @@ import zarr
 from zarr.codecs import BytesCodec, Crc32cCodec
 
 from pipeline.base.arrays import packed_size
-from pipeline.base.border import Border, shown
 from pipeline.base.differences import differences
-from pipeline.store.border import ArrayDocument, StoreAttributes, store_border
+from pipeline.base.documents import Border, shown
+from pipeline.store.documents import ArrayDocument, StoreAttributes, store_border
 
 SCHEMA = 2
 READABLE = (1, 2)

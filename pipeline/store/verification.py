@@ -6,8 +6,8 @@ from pathlib import Path
 
 from pipeline.base.errors import StoreIncomplete
 from pipeline.base.text import capped, size
-from pipeline.store.border import StoreAttributes, mend
 from pipeline.store.chunks import UNSEALED, check_metadata, damages
+from pipeline.store.documents import StoreAttributes, mend
 from pipeline.store.paths import find_attributes, read_plan
 from pipeline.store.reader import FeatureStore
 from pipeline.store.schema import ARRAY_NAMES, FEATURES, ArraySpec, check_agreement, read_spec

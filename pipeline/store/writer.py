@@ -23,7 +23,6 @@ from numpy.typing import NDArray
 
 from pipeline.base.errors import StoreIncomplete
 from pipeline.base.files import disk_full_named, sync
-from pipeline.store.border import mend, store_border
 from pipeline.store.chunks import (
     ChunkFiles,
     check_metadata,
@@ -34,7 +33,8 @@ from pipeline.store.chunks import (
     row_checksums,
     write_seal,
 )
-from pipeline.store.golden import GoldenFrames, write_golden
+from pipeline.store.documents import mend, store_border
+from pipeline.store.golden_rows import GoldenFrames, write_golden
 from pipeline.store.paths import begin_build, group_attributes, part_path, put_in_place
 from pipeline.store.schema import CHECKSUMS, FEATURES, INCREMENTAL, KEYS, ArraySpec, chunk_path
 

@@ -19,7 +19,7 @@ import torch
 from numpy.typing import NDArray
 
 from pipeline.base.config import TrainHeadParams
-from pipeline.base.source import GoldenRow
+from pipeline.base.provenance import GoldenRow
 from pipeline.policy.policy import Policy, Trainable
 from pipeline.store import Batch, FeatureStore
 

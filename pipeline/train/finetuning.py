@@ -10,12 +10,12 @@ from pathlib import Path
 
 import torch
 
-from pipeline.base.commands import command
 from pipeline.base.config import FinetuneParams, Params, TrainHeadParams, setting
 from pipeline.base.digests import file_digest
 from pipeline.base.errors import ConfigError
 from pipeline.base.files import read_document, write_with_digest
-from pipeline.base.source import (
+from pipeline.base.printed_commands import command
+from pipeline.base.provenance import (
     GoldenRow,
     TunedOn,
     join_tuned_on,

@@ -18,10 +18,10 @@ import torch
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from pipeline.base.commands import command
 from pipeline.base.config import Params
 from pipeline.base.digests import ContentDigests, ledger_path
 from pipeline.base.errors import RecordingError, StoreMismatch
+from pipeline.base.printed_commands import command
 from pipeline.data import Opened, Recording, content_digest, open_recordings
 from pipeline.data.episode import RowFrames, by_episode
 from pipeline.policy.observation import LiveObservation

@@ -16,12 +16,12 @@ from pydantic import Field
 from torch import Tensor, nn
 from tqdm import tqdm
 
-from pipeline.base.border import Document, Text
 from pipeline.base.config import TrainHeadParams
 from pipeline.base.differences import describe, differences
+from pipeline.base.documents import Document, Text
 from pipeline.base.errors import CheckpointMismatch, ConfigError, NumericsError
 from pipeline.base.files import read_document, read_tensors, sync, write_tensors, write_with_digest
-from pipeline.base.machine import resolve_device, use_bfloat16
+from pipeline.base.hardware import resolve_device, use_bfloat16
 from pipeline.base.text import duration, size
 from pipeline.policy.checkpoint import PolicyCheckpoint, Sha256, load_policy, save_policy
 from pipeline.policy.policy import Policy, Trainable, describe_size

@@ -18,10 +18,10 @@ from typing import Any, Literal
 
 from pydantic import JsonValue
 
-from pipeline.base.border import Document, Text
 from pipeline.base.channels import action_groups
 from pipeline.base.config import TrainHeadParams
 from pipeline.base.differences import differences
+from pipeline.base.documents import Document, Text
 from pipeline.base.errors import CheckpointIncomplete, CheckpointMismatch
 from pipeline.base.files import (
     REPORT,
@@ -36,7 +36,7 @@ from pipeline.base.files import (
     unmark,
     write_with_digest,
 )
-from pipeline.base.source import SourceDocument
+from pipeline.base.provenance import SourceDocument
 from pipeline.policy.checkpoint import (
     CHECKPOINT,
     DOCUMENT,

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from pipeline.base.config import SplitParams
 from pipeline.base.errors import ConfigError, StoreMismatch
-from pipeline.base.source import SIDES, Side
+from pipeline.base.provenance import SIDES, Side
 from pipeline.store import Episode, FeatureStore, episode_name
 
 _SHOWN = 5

@@ -16,7 +16,7 @@ from pipeline.base.arrays import first_non_finite, widen
 from pipeline.base.channels import action_groups, usual_spread
 from pipeline.base.config import TrainHeadParams
 from pipeline.base.errors import ConfigError, NumericsError
-from pipeline.base.source import CLOCK_SLACK_S
+from pipeline.base.provenance import CLOCK_SLACK_S
 from pipeline.policy.attention import right_aligned
 from pipeline.policy.normalization import Block, ChannelStatistics, Normalization, fit_channels
 from pipeline.policy.robot_state import RelativeActions, expand

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.base.commands import command
 from pipeline.base.differences import describe, differences
 from pipeline.base.errors import CheckpointMismatch, ConfigError
-from pipeline.base.source import SIDES, EpisodePart, Side, TunedPart, tuned_on_of_store
+from pipeline.base.printed_commands import command
+from pipeline.base.provenance import SIDES, Side, SplitPart, TunedPart, tuned_on_of_store
 from pipeline.policy.checkpoint import SOURCE_KEYS, PolicyCheckpoint
 from pipeline.store import Episode, FeatureStore, episode_name
 from pipeline.train.split import Split, ticks_of
@@ -40,7 +40,7 @@ def check_store(checkpoint: PolicyCheckpoint, store: FeatureStore) -> None:
         )
 
 
-def split_parts(store: FeatureStore, split: Split) -> dict[Side, dict[str, EpisodePart]]:
+def split_parts(store: FeatureStore, split: Split) -> dict[Side, dict[str, SplitPart]]:
     """The episodes of each side by "source/id", as a checkpoint lists them.
 
     Ticks are counted in the episode, so that they stay true when episodes are added to the store.
@@ -50,7 +50,7 @@ def split_parts(store: FeatureStore, split: Split) -> dict[Side, dict[str, Episo
 
 def _parts(
     store: FeatureStore, ticks: NDArray[np.int64], groups: Mapping[str, str]
-) -> dict[str, EpisodePart]:
+) -> dict[str, SplitPart]:
     edges = np.searchsorted(ticks, store.array("episode/tick_start"))
     parts = {}
     for index in np.flatnonzero(np.diff(edges)):
@@ -58,7 +58,7 @@ def _parts(
         name, start = episode_name(episode), episode.ticks.start
         first, stop = int(inside[0]) - start, int(inside[-1]) + 1 - start
         assert len(inside) == stop - first, "ticks of an episode on one side lie side by side"
-        parts[name] = EpisodePart(ticks=(first, stop), content=episode.content, group=groups[name])
+        parts[name] = SplitPart(ticks=(first, stop), content=episode.content, group=groups[name])
     return parts
 
 
@@ -81,7 +81,7 @@ def find_ticks(
     left: dict[str, dict[str, Episode]] = {}
     for episode in store.episodes:
         left.setdefault(episode.content, {})[episode_name(episode)] = episode
-    matches: list[tuple[Episode, EpisodePart]] = []
+    matches: list[tuple[Episode, SplitPart]] = []
     wrong: list[str] = []
     for name, part in parts.items():
         alike = left.get(part.content, {})
@@ -147,7 +147,7 @@ def refuse_tuned_episodes(store: FeatureStore, split: Split) -> list[str]:
     return []
 
 
-def _seen(parts: Mapping[str, EpisodePart], tuned: Iterable[TunedPart]) -> list[str]:
+def _seen(parts: Mapping[str, SplitPart], tuned: Iterable[TunedPart]) -> list[str]:
     """The episodes of these parts whose groups have ticks that the model has seen."""
     known: dict[str, list[tuple[int, int]]] = {}
     for part in tuned:

@@ -12,12 +12,12 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, JsonValue
 from safetensors import safe_open
 
-from pipeline.base.border import Border, Document
-from pipeline.base.commands import command
 from pipeline.base.config import VLMParams
+from pipeline.base.documents import Border, Document
 from pipeline.base.errors import VLMError
 from pipeline.base.hub import could_be_hub_id
-from pipeline.base.source import TunedOn, join_tuned_on, read_tuned_on
+from pipeline.base.printed_commands import command
+from pipeline.base.provenance import TunedOn, join_tuned_on, read_tuned_on
 
 VLMS = Border(
     VLMError,

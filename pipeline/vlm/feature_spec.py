@@ -13,12 +13,12 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from pipeline.base.commands import command
 from pipeline.base.config import VLMParams
 from pipeline.base.differences import describe, differences
 from pipeline.base.errors import VLMError
 from pipeline.base.hub import could_be_hub_id
-from pipeline.base.source import Frames, row_key
+from pipeline.base.printed_commands import command
+from pipeline.base.provenance import Frames, row_key
 from pipeline.vlm.checkpoint_folder import (
     adapter_files,
     folder_here,

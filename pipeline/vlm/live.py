@@ -16,7 +16,7 @@ from pipeline.base.config import TuningParams, VLMParams
 from pipeline.base.digests import file_digest
 from pipeline.base.errors import CheckpointMismatch, VLMError
 from pipeline.base.files import disk_full_named, sync
-from pipeline.base.machine import resolve_device
+from pipeline.base.hardware import resolve_device
 from pipeline.base.text import capped
 from pipeline.vlm.checkpoint_folder import resolve_checkpoint
 from pipeline.vlm.feature_spec import FeatureSpec, feature_spec, live_differences

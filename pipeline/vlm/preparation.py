@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from pipeline.base.border import shown
 from pipeline.base.config import VLMParams
+from pipeline.base.documents import shown
 from pipeline.base.errors import VLMError
 from pipeline.vlm.augmentation import Augmentation
 from pipeline.vlm.checkpoint_folder import resolve_checkpoint

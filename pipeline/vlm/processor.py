@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from PIL import Image
 from pydantic import ConfigDict, Field, JsonValue
 
-from pipeline.base.border import Border, Document, shown
 from pipeline.base.config import VLMParams
+from pipeline.base.documents import Border, Document, shown
 from pipeline.base.errors import VLMError
 from pipeline.vlm.checkpoint_folder import (
     VLMS,

@@ -18,7 +18,7 @@ from transformers.masking_utils import create_causal_mask, create_sliding_window
 
 from pipeline.base.config import Layer, VLMParams
 from pipeline.base.errors import NumericsError, VLMError
-from pipeline.base.machine import resolve_device
+from pipeline.base.hardware import resolve_device
 from pipeline.base.packing import Stored, pack, scales
 from pipeline.vlm.collation import Collator, TokenBatch
 from pipeline.vlm.feature_spec import FeatureSpec

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.base.border import Border, Document, Text, named, shown
+from pipeline.base.documents import Border, Document, Text, named, shown
 from pipeline.base.errors import RecordingError, StoreIncomplete
 
 BORDER = Border(RecordingError, "Copy it again.")

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.base.commands import DEFAULT_PARAMS, command, running_with
 from pipeline.base.config import setting
+from pipeline.base.printed_commands import DEFAULT_PARAMS, command, running_with
 
 
 def test_it_repeats_params_and_settings_less_its_own():

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from pipeline.base.errors import ConfigError
-from pipeline.base.machine import available_bytes, memory_bytes, resolve_device, use_bfloat16
+from pipeline.base.hardware import available_bytes, memory_bytes, resolve_device, use_bfloat16
 
 CPU, CUDA = torch.device("cpu"), torch.device("cuda")
 PAGE = mmap.PAGESIZE

@@ -18,7 +18,7 @@ from pipeline.base.errors import RecordingError
 from pipeline.data import content_digest, open_recording, open_recordings
 from pipeline.data.lerobot import action_kind
 from pipeline.data.lerobot_rows import read_clock
-from pipeline.data.lerobot_writer import LeRobotEpisode, write_data_set
+from pipeline.data.lerobot_writer import LeRobotRows, write_data_set
 from pipeline.data.timeline import build_timeline
 from tests.data.conftest import EPISODES_V3, VIEW_KEY, edit_v3, open_all
 
@@ -703,7 +703,7 @@ def test_episodes_that_are_written_with_films_are_read_again(tmp_path):
         columns = {"action": rng.random((rows, 2)).astype(np.float32)}
         columns["timestamp"] = (np.arange(rows) / 10).astype(np.float32)
         film = np.full((rows, 48, 64, 3), (shade, 90, 30), np.uint8)
-        filmed.append(LeRobotEpisode(columns, {VIEW_KEY: film}))
+        filmed.append(LeRobotRows(columns, {VIEW_KEY: film}))
     features = {"action": {"names": ["dx", "dy"], "kind": "delta"}}
     write_data_set(tmp_path / "set", iter(filmed), features, "push the T", 10, "arm")
     for recording, written, shade in zip(

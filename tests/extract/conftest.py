@@ -21,7 +21,7 @@ from PIL import Image
 
 from pipeline.base.config import Params
 from pipeline.extract import extract
-from pipeline.extract.state import StorePlaces
+from pipeline.extract.build_state import StorePlaces
 from pipeline.store import FeatureStore
 from pipeline.store.schema import ARRAY_NAMES
 from pipeline.vlm.qwen import FrozenVLM
@@ -220,7 +220,7 @@ def laid_over(document: dict[str, Any], **sections: dict[str, Any]) -> Params:
 
 FORKING = """
 import json, os, signal, sys
-import distributed, stages.extract, pipeline.extract.cluster, pipeline.extract.engine
+import distributed, stages.extract, pipeline.extract.dask_cluster, pipeline.extract.engine
 import transformers.models.qwen2_5_vl.modeling_qwen2_5_vl
 
 running = set()

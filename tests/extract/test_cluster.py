@@ -32,7 +32,7 @@ from pipeline.base.errors import (
     RecordingError,
     VLMError,
 )
-from pipeline.extract.cluster import ExtractionPlugin, connected
+from pipeline.extract.dask_cluster import ExtractionPlugin, connected
 from pipeline.extract.survey import Survey, survey
 from pipeline.store import FeatureStore, RowSource, StoreBuild, part_path
 from pipeline.vlm.feature_spec import feature_spec
@@ -49,7 +49,7 @@ from pathlib import Path
 from pipeline.base.errors import NumericsError
 from pipeline.extract.encoder import Encoder
 from pipeline.extract.rows import RowPreparation
-from pipeline.extract.cluster import ExtractionPlugin
+from pipeline.extract.dask_cluster import ExtractionPlugin
 
 control = Path({control!r})
 prepare, encode, begin = RowPreparation.prepare, Encoder.encoded, ExtractionPlugin.setup
@@ -323,7 +323,7 @@ class TestRefusals:
         plugin = ExtractionPlugin(surveyed, ())
         with pytest.raises(ConfigError, match=r"finds no build .*made\.zarr\.part"):
             plugin.check_place()
-        monkeypatch.setattr("pipeline.extract.cluster.read_plan", lambda part: "plan")
+        monkeypatch.setattr("pipeline.extract.dask_cluster.read_plan", lambda part: "plan")
         plugin.check_place()
         other_vlm = params.vlm.model_copy(update={"layers": (0,)})
         other = ExtractionPlugin(replace(surveyed, vlm=other_vlm), ())

@@ -566,7 +566,7 @@ class TestPlan:
 
 class TestRefusals:
     def test_too_little_disk_is_refused_before_the_model(self, params, monkeypatch, no_model_later):
-        monkeypatch.setattr("pipeline.extract.layout.free_bytes", lambda path: 1000)
+        monkeypatch.setattr("pipeline.extract.streams.free_bytes", lambda path: 1000)
         no_model_later(images=False)
         with pytest.raises(DiskFull, match=r"needs \d.*B, .* has \d.*B free"):
             run(params)
@@ -609,7 +609,7 @@ class TestRefusals:
 
     def test_a_row_that_no_reader_would_take(self, params, monkeypatch, no_model_later):
         no_model_later(images=False)
-        monkeypatch.setattr("pipeline.extract.layout.MOST_ROW_BYTES", 1000)
+        monkeypatch.setattr("pipeline.extract.streams.MOST_ROW_BYTES", 1000)
         with pytest.raises(ConfigError, match=r"a row of features would take.*vlm\.pooling"):
             run(params)
         assert not part_path(params.extract.store).exists()

@@ -12,7 +12,7 @@ from pipeline.data.episode import RowRange
 from pipeline.extract import extract
 from pipeline.store import FeatureStore, StoreBuild
 from pipeline.store.chunks import write_seal
-from pipeline.store.golden import GOLDEN
+from pipeline.store.golden_rows import GOLDEN
 from pipeline.store.verification import verify
 from pipeline.vlm.preparation import Preparer
 from pipeline.vlm.qwen import FrozenVLM
@@ -126,7 +126,6 @@ class TestKills:
     def test_a_kill_while_they_are_written(self, params, monkeypatch, frames):
         """With so many frames written; 8 is after the last, before sealing."""
         written = iter(range(100))
-        from pipeline.store import golden
 
         real = golden._write_frame
 

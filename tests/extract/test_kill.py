@@ -17,7 +17,7 @@ import yaml
 
 from pipeline.base.config import Params
 from pipeline.extract import extract
-from pipeline.extract.state import StorePlaces
+from pipeline.extract.build_state import StorePlaces
 from pipeline.store import FeatureStore, part_path
 from tests.extract.conftest import assert_same
 

@@ -13,7 +13,7 @@ from pipeline.base.arrays import widen
 from pipeline.base.config import Params
 from pipeline.base.packing import unpack
 from pipeline.evaluate.ablation import zeroed
-from pipeline.extract.reextract import reextract
+from pipeline.extract.row_check import reextract
 from pipeline.policy.policy import Policy
 from pipeline.store import FeatureStore
 from pipeline.store.verification import verify

@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.data.episode import by_episode
-from pipeline.extract.cluster import ranges_of
+from pipeline.extract.dask_cluster import ranges_of
 
 
 @st.composite

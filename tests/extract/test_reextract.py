@@ -11,7 +11,7 @@ from PIL import Image
 from pipeline.base.config import Params
 from pipeline.base.errors import StoreMismatch
 from pipeline.extract import extract
-from pipeline.extract.reextract import Reextraction, reextract
+from pipeline.extract.row_check import Reextraction, reextract
 from pipeline.store.schema import chunk_paths, read_spec
 from pipeline.vlm.qwen import FrozenVLM
 from pipeline.vlm.slots import TOLERANCES

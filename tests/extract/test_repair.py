@@ -15,7 +15,7 @@ from pipeline.base.config import Params
 from pipeline.base.digests import ContentDigests, ledger_path
 from pipeline.base.errors import StoreIncomplete, StoreMismatch
 from pipeline.extract import ExtractionReport, extract
-from pipeline.extract.state import row_sources
+from pipeline.extract.build_state import row_sources
 from pipeline.extract.survey import survey
 from pipeline.store import FeatureStore, StoreBuild, part_path
 from pipeline.store.schema import chunk_paths, read_spec

@@ -139,6 +139,6 @@ def test_the_plan_and_the_disk_check_count_every_variant(extracted, varied, monk
     assert needed[K] - needed[1] == (K - 1) * (features + valid)
     _, said = run(varied(extract={"plan": True}))
     assert f"disk: {size(needed[K])} for the whole store" in "\n".join(said)
-    monkeypatch.setattr("pipeline.extract.layout.free_bytes", lambda path: needed[K] - 1)
+    monkeypatch.setattr("pipeline.extract.streams.free_bytes", lambda path: needed[K] - 1)
     with pytest.raises(DiskFull, match=r"fewer vlm\.pooling slots or vlm\.variants"):
         run(varied())

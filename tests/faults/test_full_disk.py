@@ -16,7 +16,7 @@ from stages.command import run
 
 def run_unchecked(name: str, params: Path, options: Sequence[str], told: Connection) -> None:
     """Run a stage that finds room for all it plans, as where another program fills the disk."""
-    import_module("pipeline.extract.layout").free_bytes = lambda path: 2**40
+    import_module("pipeline.extract.streams").free_bytes = lambda path: 2**40
     stage = import_module(name)
     arguments = ["--params", str(params), *options]
     with redirect_stdout(StringIO()), redirect_stderr(StringIO()) as complained:

@@ -9,7 +9,7 @@ import pytest
 
 from pipeline.base.config import Params
 from pipeline.base.errors import ConfigError
-from pipeline.look.scrubbing import write_episodes
+from pipeline.look.rerun_files import write_episodes
 from pipeline.look.subject import subject_of
 from pipeline.store import FeatureStore
 

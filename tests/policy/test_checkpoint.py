@@ -19,7 +19,7 @@ from pipeline.base.files import (
     write_tensors,
     write_with_digest,
 )
-from pipeline.base.source import EpisodePart
+from pipeline.base.provenance import SplitPart
 from pipeline.policy.checkpoint import (
     PolicyCheckpoint,
     check_policy,
@@ -55,8 +55,8 @@ def store(tiny_store, tmp_path_factory):
     return FeatureStore.open(tiny_store(tmp_path_factory.mktemp("checkpoint")))
 
 
-def part(first: int, stop: int, content: str, group: str) -> EpisodePart:
-    return EpisodePart(ticks=(first, stop), content=content, group=group)
+def part(first: int, stop: int, content: str, group: str) -> SplitPart:
+    return SplitPart(ticks=(first, stop), content=content, group=group)
 
 
 @pytest.fixture

@@ -17,8 +17,7 @@ from pipeline.compat.unified import no_normalization
 from pipeline.policy.checkpoint import PolicyCheckpoint, find_policy, load_policy
 from pipeline.policy.observation import PolicyShape
 from pipeline.policy.policy import Policy
-from pipeline.robot import process
-from pipeline.robot.process import PolicyThread
+from pipeline.robot.loop_process import PolicyThread
 from pipeline.robot.server import PolicyServer, listen
 from pipeline.robot.session import ServedPolicy
 from pipeline.simulation.insertion import INSTRUCTION

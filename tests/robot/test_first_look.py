@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from pipeline.base.errors import ObservationError
-from pipeline.base.source import GoldenRow
+from pipeline.base.provenance import GoldenRow
 from pipeline.policy.checkpoint import PolicyCheckpoint
 from pipeline.policy.normalization import ChannelStatistics
 from pipeline.robot.first_look import FirstLook

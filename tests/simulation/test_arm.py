@@ -11,7 +11,7 @@ from pipeline.simulation.arm import (
     orientation,
     robot_state,
 )
-from pipeline.simulation.layout import draw_layout
+from pipeline.simulation.insertion_layout import draw_layout
 
 
 def test_orientation_is_mobile_xyz() -> None:

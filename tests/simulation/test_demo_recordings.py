@@ -13,7 +13,7 @@ from pipeline.base.errors import ConfigError, DiskFull
 from pipeline.data import Recording, open_recordings
 from pipeline.simulation import demo_recordings
 from pipeline.simulation.demo_recordings import MARKER, write_demo_recordings
-from pipeline.simulation.recorder import SimulatedEpisode
+from pipeline.simulation.recorder import Demonstration
 from pipeline.simulation.rendering import VIEWS, render
 
 SETS = ("raw", "new", "old", "lerobot")
@@ -28,7 +28,7 @@ def recordings(root: Path, name: str) -> list[Recording]:
 
 
 @cache
-def simulated(name: str) -> list[SimulatedEpisode]:
+def simulated(name: str) -> list[Demonstration]:
     """The episodes that a set was written from."""
     seeds = np.random.SeedSequence
     found = []

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from pipeline.base.config import Level
 from pipeline.simulation.arm import LAG_S, ArmMotion, orientation
-from pipeline.simulation.expert import NOT_ALIGNED_MM, REACTION_TICKS, expert_motion
+from pipeline.simulation.demonstrator import NOT_ALIGNED_MM, REACTION_TICKS, expert_motion
 from pipeline.simulation.insertion import (
     AT_LAYER_MM,
     FORCE_LIMIT_N,
@@ -22,7 +22,7 @@ from pipeline.simulation.insertion import (
     NeedleInsertion,
     Progress,
 )
-from pipeline.simulation.layout import WORKSPACE_MM, InsertionLayout, draw_layout
+from pipeline.simulation.insertion_layout import WORKSPACE_MM, InsertionLayout, draw_layout
 from pipeline.simulation.needle_sensor import BIN_MM
 from pipeline.simulation.rendering import VIEWS, render
 

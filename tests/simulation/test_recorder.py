@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from pipeline.simulation.insertion import INSERTED, NeedleInsertion
-from pipeline.simulation.layout import draw_layout
+from pipeline.simulation.insertion_layout import draw_layout
 from pipeline.simulation.recorder import simulate_episode
 from pipeline.simulation.rendering import photograph
 

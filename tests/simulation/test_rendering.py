@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from pipeline.simulation.insertion import NeedleInsertion, Scene
-from pipeline.simulation.layout import WORKSPACE_MM
+from pipeline.simulation.insertion_layout import WORKSPACE_MM
 from pipeline.simulation.rendering import HEIGHT, VIEWS, WIDTH, photograph, render
 
 SCENE = Scene(np.array([-5.0, -3.0]), np.array([0.4, 0.3]), np.array([5.0, 2.0]), 1.0)

@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 
 import stages.__main__
-from pipeline.base.commands import command as advised
 from pipeline.base.errors import RecordingError
+from pipeline.base.printed_commands import command as advised
 from stages import command
 from stages.command import Shorthand, run, short
 

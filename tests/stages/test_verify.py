@@ -9,7 +9,7 @@ import pytest
 
 from pipeline.base.errors import CheckpointMismatch
 from pipeline.extract.engine import ExtractionReport, Speed
-from pipeline.extract.reextract import Deviation, Reextraction
+from pipeline.extract.row_check import Deviation, Reextraction
 from pipeline.store import part_path
 from stages.command import run
 from stages.verify import SHORTHANDS, main
@@ -89,7 +89,7 @@ def test_rows_computed_again(verified, store, capsys, monkeypatch, relative, cod
         assert (path, params.verify.reextract) == (store, 3)
         return Reextraction((Deviation(7, relative, 2, True, "here"),), 1e-3, (), ())
 
-    monkeypatch.setattr("pipeline.extract.reextract.reextract", found)
+    monkeypatch.setattr("pipeline.extract.row_check.reextract", found)
     assert verified("--reextract", "3") == code
     said = capsys.readouterr()
     assert "computed 1 rows again" in said.out
@@ -151,7 +151,7 @@ class TestCheckpoint:
         assert proved == []
 
     def test_a_refusal(self, verified, proved, tmp_path, capsys, monkeypatch):
-        monkeypatch.setattr("pipeline.base.machine.resolve_device", lambda name: "meta")
+        monkeypatch.setattr("pipeline.base.hardware.resolve_device", lambda name: "meta")
         assert verified("--checkpoint", str(tmp_path / "head")) == 2
         assert capsys.readouterr().err.startswith("error: 2 of 2 golden rows are not")
 

@@ -16,8 +16,8 @@ import pytest
 from pipeline.base.errors import PipelineError, StoreIncomplete
 from pipeline.store import FeatureStore, RowSource, part_path
 from pipeline.store.archive import archive, restore
-from pipeline.store.border import mend, start_over
 from pipeline.store.chunks import note_metadata
+from pipeline.store.documents import mend, start_over
 from pipeline.store.paths import read_plan
 from pipeline.store.verification import verify
 from tests.store.samples import edit, put

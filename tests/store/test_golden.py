@@ -9,11 +9,11 @@ import pytest
 import zarr
 
 from pipeline.base.errors import StoreIncomplete
-from pipeline.base.source import MOST_GOLDEN, row_key, spread
+from pipeline.base.provenance import MOST_GOLDEN, row_key, spread
 from pipeline.store import FeatureStore, StoreBuild
 from pipeline.store.archive import archive, restore
 from pipeline.store.chunks import write_seal
-from pipeline.store.golden import GOLDEN, GoldenFrames
+from pipeline.store.golden_rows import GOLDEN, GoldenFrames
 from pipeline.store.merging import merge
 from pipeline.store.schema import read_specs
 from pipeline.store.verification import verify

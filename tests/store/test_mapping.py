@@ -9,8 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.store import mapping
-from pipeline.store.mapping import fitting, map_flat, populate, read_at_random, will_need
+from pipeline.store.memory_map import fitting, map_flat, populate, read_at_random, will_need
 
 PAGE = mmap.PAGESIZE
 ROWS, CHUNK = 4096, 1024

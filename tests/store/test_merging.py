@@ -13,7 +13,7 @@ import pytest
 import zarr
 
 from pipeline.base.errors import ConfigError, StoreIncomplete, StoreLocked, StoreMismatch
-from pipeline.base.source import TunedOn, TunedPart, tuned_on_attributes, tuned_on_of_store
+from pipeline.base.provenance import TunedOn, TunedPart, tuned_on_attributes, tuned_on_of_store
 from pipeline.store import Episode, FeatureStore, StoreBuild, build_lock, check_trailers
 from pipeline.store.chunks import write_seal
 from pipeline.store.merging import merge

@@ -14,7 +14,7 @@ from pydantic import ValidationError
 
 from pipeline.base.config import SplitParams
 from pipeline.base.errors import ConfigError, StoreMismatch
-from pipeline.base.source import SIDES
+from pipeline.base.provenance import SIDES
 from pipeline.train.sampling import ticks_by_source
 from pipeline.train.split import Split, episodes_by_group, hash64, split_by_episode
 

@@ -9,12 +9,12 @@ import pytest
 
 from pipeline.base.config import SplitParams
 from pipeline.base.errors import CheckpointMismatch
-from pipeline.base.source import SIDES, EpisodePart
+from pipeline.base.provenance import SIDES, SplitPart
 from pipeline.store import FeatureStore
 from pipeline.train.split import split_by_episode
 from pipeline.train.training_data import find_ticks, groups_of, split_parts
 
-Parts = Mapping[str, EpisodePart]
+Parts = Mapping[str, SplitPart]
 
 
 @dataclass(frozen=True)
@@ -27,7 +27,7 @@ class Listed:
 def parts(**told: tuple[int, int, str]) -> Parts:
     """Of `left_000=(first, stop, content)` and the like."""
     return {
-        name.replace("_", "/episode_", 1): EpisodePart(
+        name.replace("_", "/episode_", 1): SplitPart(
             ticks=(first, stop), content=content, group=f"group of {name}"
         )
         for name, (first, stop, content) in told.items()

@@ -9,7 +9,7 @@ import zarr
 
 from pipeline.base.config import SplitParams
 from pipeline.base.errors import CheckpointIncomplete, ConfigError
-from pipeline.base.source import (
+from pipeline.base.provenance import (
     SIDES,
     TUNED_ON,
     TunedOn,

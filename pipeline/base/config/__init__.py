@@ -9,8 +9,22 @@ keys and reads files.
 # ruff: noqa: F401
 # pyright: reportUnusedImport=false
 
+from pipeline.base.config.extraction import (
+    AugmentationParams,
+    DataParams,
+    ExtractParams,
+    GridPooling,
+    InspectParams,
+    Layer,
+    MediaLimits,
+    Pooling,
+    ProbeParams,
+    Source,
+    StoresParams,
+    VLMParams,
+)
 from pipeline.base.config.params import Params, described_keys, load_params, load_section, setting
-from pipeline.base.config.policy_use import (
+from pipeline.base.config.policies import (
     PHANTOM,
     Chunking,
     DriveParams,
@@ -24,20 +38,6 @@ from pipeline.base.config.policy_use import (
     ServeParams,
     environments,
     latencies_ms,
-)
-from pipeline.base.config.stage_one import (
-    AugmentationParams,
-    DataParams,
-    ExtractParams,
-    GridPooling,
-    InspectParams,
-    Layer,
-    MediaLimits,
-    Pooling,
-    ProbeParams,
-    Source,
-    StoresParams,
-    VLMParams,
 )
 from pipeline.base.config.training import (
     DiffusionParams,

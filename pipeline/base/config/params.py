@@ -13,18 +13,7 @@ import yaml
 from pydantic import ValidationError
 from pydantic.fields import FieldInfo
 
-from pipeline.base.border import Border, named, problems, shown
-from pipeline.base.config.policy_use import (
-    CompareParams,
-    DriveParams,
-    EvaluateParams,
-    ExportParams,
-    PushParams,
-    RolloutParams,
-    ServeParams,
-)
-from pipeline.base.config.section import Section
-from pipeline.base.config.stage_one import (
+from pipeline.base.config.extraction import (
     ArchiveParams,
     DataParams,
     DemoParams,
@@ -35,7 +24,18 @@ from pipeline.base.config.stage_one import (
     VerifyParams,
     VLMParams,
 )
+from pipeline.base.config.policies import (
+    CompareParams,
+    DriveParams,
+    EvaluateParams,
+    ExportParams,
+    PushParams,
+    RolloutParams,
+    ServeParams,
+)
+from pipeline.base.config.section import Section
 from pipeline.base.config.training import FinetuneParams, TrainHeadParams
+from pipeline.base.documents import Border, named, problems, shown
 from pipeline.base.errors import ConfigError
 
 

@@ -24,7 +24,7 @@ from pipeline.data import CameraStream
 from pipeline.data.timeline import last_at
 from pipeline.look.page.blocks import Block, Text
 from pipeline.look.page.style import draw_frame, panels
-from pipeline.look.recording.episode import BROKEN, Draw, EpisodeView, runs
+from pipeline.look.recording.episode import BROKEN, Draw, LoadedRecording, runs
 
 MOST_FRAMES, RUNS = 120, 12
 # Standard deviation of the colour that varies most, of 255, up to which a frame shows nothing.
@@ -35,7 +35,7 @@ STILL_PAIRS, MOVING_PAIRS = 5, 20
 _COLUMN_IN = 2.3
 
 
-def camera_blocks(view: EpisodeView, draw: Draw, params: Params) -> list[Block]:
+def camera_blocks(view: LoadedRecording, draw: Draw, params: Params) -> list[Block]:
     """The picture of the views at `inspect.ticks` ticks, and why a view is not shown.
 
     Empty without ticks or views.
@@ -50,14 +50,14 @@ def camera_blocks(view: EpisodeView, draw: Draw, params: Params) -> list[Block]:
     return [*absent, draw("views", caption, lambda view: draw_views(view, ticks))]
 
 
-def spread_ticks(view: EpisodeView, count: int) -> list[int]:
+def spread_ticks(view: LoadedRecording, count: int) -> list[int]:
     """At most `count` different ticks, evenly from the first to the last; none without ticks."""
     last = -1 if view.timeline is None else len(view.timeline.time) - 1
     return np.unique(np.linspace(0, last, count).round().astype(int)).tolist() if last >= 0 else []
 
 
 def read_frames(
-    view: EpisodeView, ticks: Sequence[int]
+    view: LoadedRecording, ticks: Sequence[int]
 ) -> tuple[dict[str, list[NDArray[np.uint8]]], tuple[Issue, ...]]:
     """By view, the last frame (height, width, 3) RGB at or before each of these rising ticks.
 
@@ -74,7 +74,7 @@ def read_frames(
     return frames, tuple(broken)
 
 
-def draw_views(view: EpisodeView, ticks: Sequence[int]) -> Figure:
+def draw_views(view: LoadedRecording, ticks: Sequence[int]) -> Figure:
     """The last frame of each view (row) at each tick (column), and how old it was then."""
     assert view.timeline is not None
     frames, _ = read_frames(view, ticks)
@@ -93,7 +93,7 @@ def draw_views(view: EpisodeView, ticks: Sequence[int]) -> Figure:
     return figure
 
 
-def _shown_at(view: EpisodeView, name: str, ticks: Sequence[int]) -> NDArray[np.int64]:
+def _shown_at(view: LoadedRecording, name: str, ticks: Sequence[int]) -> NDArray[np.int64]:
     line = view.timeline
     assert line is not None
     return last_at(view.cameras[name].time, line.time[list(ticks)], line.slack_s)
@@ -112,7 +112,7 @@ class _Compared:
     blank: dict[int, bool]
 
 
-def find_frame_issues(view: EpisodeView) -> Iterator[Issue]:
+def find_frame_issues(view: LoadedRecording) -> Iterator[Issue]:
     """Issues of kind unreadable, dead camera and duplicate frames."""
     compared: dict[str, _Compared] = {}
     for name, camera in view.cameras.items():
@@ -126,7 +126,7 @@ def find_frame_issues(view: EpisodeView) -> Iterator[Issue]:
             yield from _duplicates(view, name, compared)
 
 
-def _compare(view: EpisodeView, name: str, camera: CameraStream) -> _Compared:
+def _compare(view: LoadedRecording, name: str, camera: CameraStream) -> _Compared:
     count, equal = len(camera.time), camera.repeats()
     if equal is not None and view.timeline is not None:
         served = np.unique(view.timeline.frames[name]).tolist()
@@ -157,7 +157,7 @@ def _spread_runs(frames: int) -> NDArray[np.int64]:
     return np.unique(starts[:, None] + np.arange(length))
 
 
-def _dead(view: EpisodeView, name: str, blank: Mapping[int, bool]) -> Iterator[Issue]:
+def _dead(view: LoadedRecording, name: str, blank: Mapping[int, bool]) -> Iterator[Issue]:
     time, frames = view.cameras[name].time, list(blank)
     for first, stop in runs(np.array(list(blank.values()), np.bool_)):
         start, last = frames[first], frames[stop - 1]
@@ -169,7 +169,9 @@ def _dead(view: EpisodeView, name: str, blank: Mapping[int, bool]) -> Iterator[I
         yield view.issue("dead camera", f"view {name}", message, *span)
 
 
-def _duplicates(view: EpisodeView, name: str, compared: Mapping[str, _Compared]) -> Iterator[Issue]:
+def _duplicates(
+    view: LoadedRecording, name: str, compared: Mapping[str, _Compared]
+) -> Iterator[Issue]:
     own, kind, stream = compared[name], "duplicate frames", f"view {name}"
     if len(own.equal) >= STILL_PAIRS and own.equal.all():
         message = f"all {len(own.index)} frames looked at are one picture; expected a moving one"
@@ -185,7 +187,11 @@ def _duplicates(view: EpisodeView, name: str, compared: Mapping[str, _Compared])
 
 
 def _others_move(
-    view: EpisodeView, name: str, compared: Mapping[str, _Compared], start_s: float, stop_s: float
+    view: LoadedRecording,
+    name: str,
+    compared: Mapping[str, _Compared],
+    start_s: float,
+    stop_s: float,
 ) -> bool:
     """Whether there are other cameras, and each of them sees changes between two instants."""
     moving: list[int] = []

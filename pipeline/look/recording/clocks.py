@@ -21,7 +21,7 @@ from pipeline.base.text import Table
 from pipeline.data.timeline import Timeline
 from pipeline.look.page.blocks import Block
 from pipeline.look.page.style import INK, PALETTE, panels
-from pipeline.look.recording.episode import Draw, EpisodeView
+from pipeline.look.recording.episode import Draw, LoadedRecording
 
 # A step of so many usual steps or more is a gap.
 GAP_FACTOR = 2.5
@@ -113,7 +113,7 @@ class Clock:
         return float(small.std()) if len(small) > 1 else float("nan")
 
 
-def read_clocks(view: EpisodeView) -> list[Clock]:
+def read_clocks(view: LoadedRecording) -> list[Clock]:
     """Every clock of the episode: cameras and streams, then ticks and VL rows."""
     clocks = [
         Clock(name, "camera" if name.startswith("view ") else "stream", time)
@@ -159,7 +159,7 @@ def _merge_equal(clocks: Iterable[Clock]) -> list[Clock]:
     return [replace(same[0], name=", ".join(c.name for c in same)) for same in alike.values()]
 
 
-def find_clock_issues(view: EpisodeView) -> Iterator[Issue]:
+def find_clock_issues(view: LoadedRecording) -> Iterator[Issue]:
     """Issues of kind gap, repeated times and dropped frames.
 
     A gap shorter than a tick is no issue: no tick loses a reading by it.
@@ -179,7 +179,7 @@ def find_clock_issues(view: EpisodeView) -> Iterator[Issue]:
             yield from _dropped(view, clock)
 
 
-def _dropped(view: EpisodeView, clock: Clock) -> Iterator[Issue]:
+def _dropped(view: LoadedRecording, clock: Clock) -> Iterator[Issue]:
     """A camera that loses frames one by one; gaps are separate issues."""
     steps = np.diff(clock.time)
     small = steps < clock.shortest_gap_s
@@ -200,12 +200,12 @@ def _dropped(view: EpisodeView, clock: Clock) -> Iterator[Issue]:
     yield view.issue("dropped frames", clock.name, message, *span)
 
 
-def _tick_s(view: EpisodeView) -> float:
+def _tick_s(view: LoadedRecording) -> float:
     line = view.timeline
     return _TICK_S if line is None or len(line.time) < 2 else usual_step(line.time)
 
 
-def clock_blocks(view: EpisodeView, draw: Draw, params: Params) -> list[Block]:
+def clock_blocks(view: LoadedRecording, draw: Draw, params: Params) -> list[Block]:
     """The lanes and a table of all clocks, including ticks and VL rows; empty without any."""
     clocks = read_clocks(view)
     if not clocks:
@@ -217,7 +217,7 @@ def clock_blocks(view: EpisodeView, draw: Draw, params: Params) -> list[Block]:
     return [draw("clocks", caption, draw_lanes), clock_table(view, clocks)]
 
 
-def clock_table(view: EpisodeView, clocks: Sequence[Clock]) -> Table:
+def clock_table(view: LoadedRecording, clocks: Sequence[Clock]) -> Table:
     """Rates, jitter and gaps by clock."""
     heads = ("clock", "entries", "first [s]", "last [s]")
     heads += ("usual rate [Hz]", "on average [Hz]", "jitter [ms]", "gaps")
@@ -233,7 +233,7 @@ def clock_table(view: EpisodeView, clocks: Sequence[Clock]) -> Table:
     return Table(heads, rows, caption)
 
 
-def draw_lanes(view: EpisodeView) -> Figure:
+def draw_lanes(view: LoadedRecording) -> Figure:
     """A lane for each clock, over about five VL rows.
 
     Lines lead from each frame to the VL row that took it, and from the row to the ticks that reuse
@@ -257,7 +257,7 @@ def draw_lanes(view: EpisodeView) -> Figure:
     return figure
 
 
-def _choose_span(view: EpisodeView, clocks: Sequence[Clock]) -> tuple[float, float]:
+def _choose_span(view: LoadedRecording, clocks: Sequence[Clock]) -> tuple[float, float]:
     """Start and stop in s of the picture: five VL rows, around the first gap if any."""
     start = min(float(clock.time[0]) for clock in clocks)
     stop = max(float(clock.time[-1]) for clock in clocks)

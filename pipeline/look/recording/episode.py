@@ -1,7 +1,7 @@
 """One recording with every part that can be read, and an issue for every part that cannot.
 
 All times are float64 seconds on the recording's own clock; pictures and tables subtract
-`EpisodeView.zero`.
+`LoadedRecording.zero`.
 """
 
 from collections.abc import Callable, Mapping
@@ -25,7 +25,7 @@ BROKEN = (RecordingError, OSError)
 
 
 @dataclass(frozen=True)
-class EpisodeView:
+class LoadedRecording:
     """One recording with every part that could be read.
 
     A part that could not be read is None, or absent from `cameras`, and an issue of kind
@@ -94,10 +94,12 @@ class EpisodeView:
 
 
 # Makes a picture of an episode from a name, a caption and the function that draws it.
-Draw = Callable[[str, str, Callable[[EpisodeView], Figure]], Picture]
+Draw = Callable[[str, str, Callable[[LoadedRecording], Figure]], Picture]
 
 
-def view_episode(recording: Recording, data: DataParams, rotation: ActionRotation) -> EpisodeView:
+def view_episode(
+    recording: Recording, data: DataParams, rotation: ActionRotation
+) -> LoadedRecording:
     """Every part of this recording that can be read, and its ticks under `data`.
 
     No frame is decoded. A part that cannot be read becomes an issue `unreadable`, streams that
@@ -119,7 +121,7 @@ def view_episode(recording: Recording, data: DataParams, rotation: ActionRotatio
     parts["cameras"] = parts["cameras"] or {}
     # Poses are mostly columns of the state: then a broken state must be one issue, not two.
     parts["poses"] = None if "state" in broken else attempt("poses")
-    view = EpisodeView(recording, **parts, action_rotation=rotation)
+    view = LoadedRecording(recording, **parts, action_rotation=rotation)
     # One broken file breaks every stream in it: its message must be there once.
     issues = [
         view.issue(
@@ -146,7 +148,7 @@ def runs(flags: NDArray[np.bool_]) -> list[tuple[int, int]]:
     return [(int(start), int(stop)) for start, stop in edges]
 
 
-def _timeline(view: EpisodeView, data: DataParams) -> Timeline:
+def _timeline(view: LoadedRecording, data: DataParams) -> Timeline:
     # The parts that were read replace the methods that would read them again.
     read = copy(view.recording)
     read.cameras, read.poses, read.action = (

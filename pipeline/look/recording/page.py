@@ -24,7 +24,7 @@ from pipeline.data.timeline import ActionRotation, choose_action_rotation, rate_
 from pipeline.look.page.blocks import Issues, Picture, Report, Section, Text, next_steps
 from pipeline.look.recording.cameras import camera_blocks, find_frame_issues
 from pipeline.look.recording.clocks import clock_blocks, find_clock_issues
-from pipeline.look.recording.episode import Draw, EpisodeView, view_episode
+from pipeline.look.recording.episode import Draw, LoadedRecording, view_episode
 from pipeline.look.recording.samples import prompt_blocks, sample_blocks
 from pipeline.look.recording.streams import (
     find_channel_issues,
@@ -49,7 +49,7 @@ ROWS = 100
 
 @dataclass
 class RecordingSummary:
-    """One recording in a line; `counts` are entries by clock (`EpisodeView.clocks`)."""
+    """One recording in a line; `counts` are entries by clock (`LoadedRecording.clocks`)."""
 
     source: str
     episode: str
@@ -151,7 +151,7 @@ def survey_recordings(opened: Opened, params: Params) -> RecordingsOverview:
     return RecordingsOverview(tuple(summaries), tuple(common), rotation)
 
 
-def _summarise(view: EpisodeView) -> RecordingSummary:
+def _summarise(view: LoadedRecording) -> RecordingSummary:
     recording, line = view.recording, view.timeline
     return RecordingSummary(
         source=recording.source,
@@ -167,7 +167,7 @@ def _summarise(view: EpisodeView) -> RecordingSummary:
     )
 
 
-def find_issues(view: EpisodeView) -> tuple[Issue, ...]:
+def find_issues(view: LoadedRecording) -> tuple[Issue, ...]:
     """The issues of this episode and of reading it: errors first, then by time."""
     issues = list(view.issues)
     issues += [*find_clock_issues(view), *_missing(view)]
@@ -176,7 +176,7 @@ def find_issues(view: EpisodeView) -> tuple[Issue, ...]:
     return tuple(issues)
 
 
-def _missing(view: EpisodeView) -> Iterator[Issue]:
+def _missing(view: LoadedRecording) -> Iterator[Issue]:
     """An episode without a picture."""
     if view.cameras or any("cameras" in issue.stream.split(", ") for issue in view.issues):
         return
@@ -234,7 +234,7 @@ def recordings_report(opened: Opened, params: Params, name: str) -> Report:
     summaries, chosen = overview.summaries, overview.choose(params.inspect.episodes)
 
     @lru_cache(maxsize=1)
-    def view_of(index: int) -> EpisodeView:
+    def view_of(index: int) -> LoadedRecording:
         return view_episode(opened.recordings[index], params.data, overview.rotation)
 
     def drawer(index: int, prefix: str) -> Draw:
@@ -336,7 +336,7 @@ def _episodes_table(overview: RecordingsOverview, chosen: Sequence[int]) -> Tabl
 
 
 def _episode_section(
-    overview: RecordingsOverview, index: int, view: EpisodeView, draw: Draw, params: Params
+    overview: RecordingsOverview, index: int, view: LoadedRecording, draw: Draw, params: Params
 ) -> Section:
     """Every topic of one episode."""
     summary = overview.summaries[index]

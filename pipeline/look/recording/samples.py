@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 
 from pipeline.base.config import Params, VLMParams
 from pipeline.base.errors import PipelineError, RecordingError
-from pipeline.base.source import CLOCK_SLACK_S
+from pipeline.base.provenance import CLOCK_SLACK_S
 from pipeline.base.text import Table
 from pipeline.look.page.blocks import Block, Text, TokenRun, Tokens
 from pipeline.look.page.style import INK, draw_frame, panels
 from pipeline.look.recording.cameras import read_frames
-from pipeline.look.recording.episode import BROKEN, Draw, EpisodeView
+from pipeline.look.recording.episode import BROKEN, Draw, LoadedRecording
 from pipeline.look.recording.streams import ChannelGroup, legend_beside, named_groups, plot_curves
 from pipeline.vlm.feature_spec import FeatureSpec, feature_spec
 from pipeline.vlm.preparation import Preparer
@@ -46,7 +46,7 @@ class Sample:
     windows: Mapping[str, NDArray[np.float32]]
 
 
-def sample_blocks(view: EpisodeView, draw: Draw, params: Params) -> list[Block]:
+def sample_blocks(view: LoadedRecording, draw: Draw, params: Params) -> list[Block]:
     """`inspect.samples` samples of an episode side by side and as a batch, or why there is none."""
     try:
         samples = cut_samples(view, params)
@@ -64,7 +64,7 @@ def window_lengths(params: Params) -> dict[str, int]:
     return {"sensor": head.sensor_window, "state": head.state_window, "action": head.horizon}
 
 
-def cut_samples(view: EpisodeView, params: Params) -> list[Sample]:
+def cut_samples(view: LoadedRecording, params: Params) -> list[Sample]:
     """At most `inspect.samples` different samples of an episode, as training cuts them.
 
     They are in order of time. The first is the episode's first tick, whose windows begin with
@@ -100,7 +100,7 @@ def cut_samples(view: EpisodeView, params: Params) -> list[Sample]:
 
 
 def draw_samples(
-    view: EpisodeView, samples: Sequence[Sample], lengths: Mapping[str, int]
+    view: LoadedRecording, samples: Sequence[Sample], lengths: Mapping[str, int]
 ) -> Figure:
     """The samples side by side, a column each: frames, windows, action chunk.
 
@@ -182,7 +182,7 @@ def _draw_row(
         legend_beside(axes[-1])
 
 
-def _sample_title(view: EpisodeView, tick: int) -> str:
+def _sample_title(view: LoadedRecording, tick: int) -> str:
     """Which tick a column shows, and how old its features are."""
     line = view.timeline
     assert line is not None
@@ -194,7 +194,7 @@ def _sample_title(view: EpisodeView, tick: int) -> str:
     )
 
 
-def prompt_blocks(view: EpisodeView, params: Params, views: Sequence[str]) -> list[Block]:
+def prompt_blocks(view: LoadedRecording, params: Params, views: Sequence[str]) -> list[Block]:
     """The prompt of the episode's first VL row, or why it cannot be shown."""
     try:
         # The digest is left out: it does not change the prompt, and it would read every weight.
@@ -204,7 +204,7 @@ def prompt_blocks(view: EpisodeView, params: Params, views: Sequence[str]) -> li
         return [Text(f"The prompt cannot be shown: {error}")]
 
 
-def show_prompt(view: EpisodeView, vlm: VLMParams, spec: FeatureSpec) -> list[Block]:
+def show_prompt(view: LoadedRecording, vlm: VLMParams, spec: FeatureSpec) -> list[Block]:
     """The prompt of the episode's first VL row: its tokens, and a table of images.
 
     Loads the checkpoint's tokenizer and settings, no weight. Raises `VLMError` where the checkpoint

@@ -23,7 +23,7 @@ from pipeline.data.timeline import last_at
 from pipeline.look.page.blocks import Block
 from pipeline.look.page.style import PALETTE, panels, shorten_middle
 from pipeline.look.recording.clocks import Clock, usual_step
-from pipeline.look.recording.episode import Draw, EpisodeView
+from pipeline.look.recording.episode import Draw, LoadedRecording
 
 # An outlier is so many times farther from its neighbours than 95 % of the entries are, and farther
 # than all others are apart.
@@ -112,7 +112,7 @@ def named_groups(streams: Mapping[str, Stream]) -> list[tuple[str, ChannelGroup]
     return [(name, group) for name in streams for group in group_channels(streams[name].channels)]
 
 
-def sensor_blocks(view: EpisodeView, draw: Draw, params: Params) -> list[Block]:
+def sensor_blocks(view: LoadedRecording, draw: Draw, params: Params) -> list[Block]:
     """The picture of the sensor, contact marked; empty without one."""
     if view.sensor is None:
         return []
@@ -121,7 +121,7 @@ def sensor_blocks(view: EpisodeView, draw: Draw, params: Params) -> list[Block]:
     return [draw("sensor", caption, draw_sensor)]
 
 
-def motion_blocks(view: EpisodeView, draw: Draw, params: Params) -> list[Block]:
+def motion_blocks(view: LoadedRecording, draw: Draw, params: Params) -> list[Block]:
     """The picture of state, poses and actions; empty without any."""
     if not {"state", "poses", "action"} & view.streams.keys():
         return []
@@ -129,7 +129,7 @@ def motion_blocks(view: EpisodeView, draw: Draw, params: Params) -> list[Block]:
     return [draw("motion", caption, draw_motion)]
 
 
-def contacts(view: EpisodeView) -> list[tuple[float, float]]:
+def contacts(view: LoadedRecording) -> list[tuple[float, float]]:
     """Start and stop in s of each contact, by the force alone; none without a force."""
     sensor = view.sensor
     columns = [] if sensor is None else force_columns(sensor.channels.names)
@@ -140,7 +140,7 @@ def contacts(view: EpisodeView) -> list[tuple[float, float]]:
     return contact_spans(sensor.time, force, newton, usual_step(sensor.time))
 
 
-def draw_sensor(view: EpisodeView) -> Figure:
+def draw_sensor(view: LoadedRecording) -> Figure:
     """Curves of the sensor by unit above, a profile such as the A-scan as an image below.
 
     The spans in contact are shaded in all panels, over one axis of time.
@@ -164,7 +164,7 @@ def draw_sensor(view: EpisodeView) -> Figure:
     return figure
 
 
-def draw_motion(view: EpisodeView) -> Figure:
+def draw_motion(view: LoadedRecording) -> Figure:
     """State and poses in panels by unit, and below them the actions, held from tick to tick.
 
     If the channels of a panel are so far apart that no motion could be seen, the panel shows their
@@ -270,7 +270,7 @@ def _draw_profile(axis: Axes, stream: Stream, group: ChannelGroup, zero: float) 
     axis.figure.colorbar(drawn, cax=bar, label=f"{group.profile} {unit}", extend="both")
 
 
-def statistics_blocks(view: EpisodeView, draw: Draw, params: Params) -> list[Block]:
+def statistics_blocks(view: LoadedRecording, draw: Draw, params: Params) -> list[Block]:
     """A row for each channel, one row for all channels of a profile; empty without any stream.
 
     The row of a profile has the least and greatest value of all its channels; its other numbers are
@@ -306,7 +306,7 @@ def describe_channels(values: NDArray[np.floating], columns: Sequence[int]) -> N
     return np.concatenate(parts)
 
 
-def find_channel_issues(view: EpisodeView) -> Iterator[Issue]:
+def find_channel_issues(view: LoadedRecording) -> Iterator[Issue]:
     """Issues of kind flat channel, still channel, action and state outlier."""
     for name, stream in view.streams.items():
         if name != "poses" and len(stream.time) >= _FEWEST:
@@ -317,7 +317,7 @@ def find_channel_issues(view: EpisodeView) -> Iterator[Issue]:
         yield from _outliers(view, "state", "row", view.state)
 
 
-def _unmoved(view: EpisodeView, name: str, stream: Stream) -> Iterator[Issue]:
+def _unmoved(view: LoadedRecording, name: str, stream: Stream) -> Iterator[Issue]:
     """Channels that never change, and channels that hardly move compared with similar ones."""
     names, values = stream.channels.names, stream.values
     varies = np.ptp(values, axis=0) > 0
@@ -338,7 +338,7 @@ def _unmoved(view: EpisodeView, name: str, stream: Stream) -> Iterator[Issue]:
         yield view.issue("still channel", name, message)
 
 
-def _outliers(view: EpisodeView, name: str, entry: str, stream: Stream) -> Iterator[Issue]:
+def _outliers(view: LoadedRecording, name: str, entry: str, stream: Stream) -> Iterator[Issue]:
     """Single entries that jump away and back, unlike any other of the episode."""
     time, values = stream.time, stream.values.astype(np.float64)
     if len(time) < _FEWEST:

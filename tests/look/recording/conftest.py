@@ -15,7 +15,7 @@ from pipeline.base.errors import Issue
 from pipeline.data import Channels, Stream, open_recordings
 from pipeline.data.timeline import choose_action_rotation
 from pipeline.look.page.style import RC
-from pipeline.look.recording.episode import EpisodeView, view_episode
+from pipeline.look.recording.episode import LoadedRecording, view_episode
 from pipeline.look.recording.page import find_issues
 from pipeline.simulation import rendering
 from pipeline.simulation.insertion_formats import (
@@ -70,10 +70,10 @@ def copied(healthy: Path, tmp_path: Path) -> Callable[[str], Path]:
 
 
 @pytest.fixture(scope="session")
-def look() -> Callable[..., EpisodeView]:
+def look() -> Callable[..., LoadedRecording]:
     """`look(folder, action_hz=10)`: the one recording there, as far as it can be read."""
 
-    def view(folder: Path, **data: Any) -> EpisodeView:
+    def view(folder: Path, **data: Any) -> LoadedRecording:
         source = Source(name="s", path=str(folder))
         params = DataParams(sources=(source,), **data)
         (recording,) = open_recordings([source], views=params.views).recordings
@@ -83,7 +83,7 @@ def look() -> Callable[..., EpisodeView]:
 
 
 @pytest.fixture(scope="session")
-def issues_of(look: Callable[..., EpisodeView]) -> Callable[..., tuple[Issue, ...]]:
+def issues_of(look: Callable[..., LoadedRecording]) -> Callable[..., tuple[Issue, ...]]:
     """`issues_of(folder)`: what looks wrong in the one recording there, by its own clock."""
 
     def find(folder: Path, **data: Any) -> tuple[Issue, ...]:
@@ -126,16 +126,16 @@ def change_csv() -> Callable[[Path, Callable[[np.ndarray], np.ndarray]], None]:
 
 
 @pytest.fixture(scope="session")
-def view(healthy: Path, look: Callable[..., EpisodeView]) -> EpisodeView:
+def view(healthy: Path, look: Callable[..., LoadedRecording]) -> LoadedRecording:
     """A raw episode of three views, whose robot's clock has a gap, not to be changed."""
     return look(healthy / "raw")
 
 
 @pytest.fixture
-def felt(view: EpisodeView) -> Callable[..., EpisodeView]:
+def felt(view: LoadedRecording) -> Callable[..., LoadedRecording]:
     """`felt(names, units, time, values)`: that episode with this sensor, beginning at time 0."""
 
-    def build(names: Any, units: Any, time: np.ndarray, values: np.ndarray) -> EpisodeView:
+    def build(names: Any, units: Any, time: np.ndarray, values: np.ndarray) -> LoadedRecording:
         stream = Stream(Channels(tuple(names), tuple(units)), time, values.astype(np.float32))
         return replace(view, sensor=stream, zero=0.0)
 

@@ -10,7 +10,7 @@ import pytest
 
 from pipeline.base.errors import Issue
 from pipeline.look.recording.clocks import Clock, Gap, find_clock_issues, usual_step
-from pipeline.look.recording.episode import EpisodeView
+from pipeline.look.recording.episode import LoadedRecording
 
 
 def gaps(time: np.ndarray) -> tuple[Gap, ...]:
@@ -55,7 +55,7 @@ def set_by(time: np.ndarray, seconds: float, at: float = 30) -> np.ndarray:
 
 
 @pytest.fixture
-def find(healthy: Path, look: Callable[..., EpisodeView]) -> Find:
+def find(healthy: Path, look: Callable[..., LoadedRecording]) -> Find:
     """`find({"sensor": time, "view View1": time})`: clock issues of streams with these times."""
     view = look(healthy / "raw")
 

@@ -9,10 +9,10 @@ import pytest
 from pipeline.base.errors import RecordingError
 from pipeline.look.recording.cameras import read_frames, spread_ticks
 from pipeline.look.recording.clocks import read_clocks
-from pipeline.look.recording.episode import EpisodeView
+from pipeline.look.recording.episode import LoadedRecording
 from pipeline.look.recording.page import find_issues
 
-Look = Callable[..., EpisodeView]
+Look = Callable[..., LoadedRecording]
 
 
 def only(folder: Path, pattern: str) -> Path:

@@ -15,7 +15,7 @@ from pipeline.base.config import DataParams, Source
 from pipeline.base.errors import Issue
 from pipeline.data import open_recordings
 from pipeline.look.recording.clocks import find_clock_issues
-from pipeline.look.recording.episode import EpisodeView, view_episode
+from pipeline.look.recording.episode import LoadedRecording, view_episode
 from pipeline.look.recording.streams import find_channel_issues
 
 Find = Callable[..., tuple[Issue, ...]]
@@ -221,7 +221,9 @@ class TestChannels:
         assert [key[0] for key in found if key[1:] == ("still channel", "action")] == ids
 
 
-def test_a_recording_may_be_very_short(copied: Copied, look: Callable[..., EpisodeView], issues_of):
+def test_a_recording_may_be_very_short(
+    copied: Copied, look: Callable[..., LoadedRecording], issues_of
+):
     folder = copied("raw")
     for view in ("View1", "View2", "View5"):
         for path in frames(folder, view)[1:]:

@@ -15,7 +15,7 @@ from pipeline.data import Channels, Stream
 from pipeline.look.page.blocks import Picture, Text
 from pipeline.look.recording.cameras import camera_blocks, draw_views
 from pipeline.look.recording.clocks import Clock, clock_blocks, draw_lanes
-from pipeline.look.recording.episode import EpisodeView
+from pipeline.look.recording.episode import LoadedRecording
 from pipeline.look.recording.streams import (
     contacts,
     draw_motion,
@@ -33,10 +33,10 @@ PARAMS = Params.model_validate(
         "inspect": {"samples": 1},
     }
 )
-Felt = Callable[..., EpisodeView]
+Felt = Callable[..., LoadedRecording]
 
 
-def test_views_are_shown_at_ticks_with_the_age_of_each_frame(view: EpisodeView) -> None:
+def test_views_are_shown_at_ticks_with_the_age_of_each_frame(view: LoadedRecording) -> None:
     assert view.timeline is not None
     figure = draw_views(view, [3, 5])
     assert [len(axis.images) for axis in figure.axes] == [1] * 6
@@ -53,7 +53,7 @@ def test_a_view_that_is_not_shown_is_said(copied, look, draw) -> None:
     assert isinstance(text, Text) and text.words.startswith("view View2 is not shown: ")
 
 
-def test_contact_is_marked_over_the_force_and_over_the_scan(view: EpisodeView) -> None:
+def test_contact_is_marked_over_the_force_and_over_the_scan(view: LoadedRecording) -> None:
     force, scan = draw_sensor(view).axes[:2]
     edges = [at - view.zero for at in contacts(view)[0]]
     span = force.patches[0]
@@ -66,7 +66,7 @@ def test_contact_is_marked_over_the_force_and_over_the_scan(view: EpisodeView) -
     assert [left, right] == pytest.approx(ends, abs=0.01)
 
 
-def test_names_are_written_as_they_are(view: EpisodeView) -> None:
+def test_names_are_written_as_they_are(view: LoadedRecording) -> None:
     names = ("cost_$5_$6", "$\\foo$", "<b>x</b>", "_hidden", "100%")
     stream = Stream(
         Channels(names, ("$\\bar$",) * 5), np.arange(9) / 9, np.eye(9, 5, dtype=np.float32)
@@ -98,12 +98,12 @@ def test_a_scan_is_blank_where_its_clock_has_a_gap_and_nowhere_else(felt: Felt) 
 
 
 @pytest.fixture
-def draw(view: EpisodeView) -> Callable[..., Picture]:
+def draw(view: LoadedRecording) -> Callable[..., Picture]:
     """Makes pictures of that episode."""
     return lambda name, caption, draw: Picture(name, caption, lambda: draw(view))
 
 
-def test_motion_says_from_where_each_joint_moved_and_holds_actions(view: EpisodeView) -> None:
+def test_motion_says_from_where_each_joint_moved_and_holds_actions(view: LoadedRecording) -> None:
     joints, _, actions, *_ = draw_motion(view).axes
     assert view.state is not None
     assert joints.lines[0].get_label() == f"joint_1 from {view.state.values[0, 0]:.4g}"
@@ -121,7 +121,7 @@ def test_long_curves_are_bitmaps_that_keep_every_extreme(felt: Felt) -> None:
     assert (max(line.get_ydata()), min(line.get_ydata())) == (7, -3)
 
 
-def test_lanes_show_every_clock_once_with_its_gap(view: EpisodeView) -> None:
+def test_lanes_show_every_clock_once_with_its_gap(view: LoadedRecording) -> None:
     (axis,) = draw_lanes(view).axes
     names = [label.get_text() for label in axis.get_yticklabels()]
     views = ["view View1", "view View2", "view View5"]

@@ -13,7 +13,7 @@ from pipeline.base.errors import RecordingError, VLMError
 from pipeline.base.text import Table
 from pipeline.datasets import UnifiedVLADataset
 from pipeline.look.page.blocks import Text, Tokens
-from pipeline.look.recording.episode import EpisodeView
+from pipeline.look.recording.episode import LoadedRecording
 from pipeline.look.recording.samples import (
     Sample,
     batch_table,
@@ -25,7 +25,7 @@ from pipeline.look.recording.samples import (
 from pipeline.vlm.feature_spec import FeatureSpec, feature_spec
 from pipeline.vlm.preparation import Preparer
 
-Look = Callable[..., EpisodeView]
+Look = Callable[..., LoadedRecording]
 WINDOWS = {"horizon": 6, "sensor_window": 40, "state_window": 30}
 
 
@@ -96,13 +96,13 @@ def params() -> Params:
 
 
 @pytest.fixture(scope="module")
-def samples(view: EpisodeView, params: Params) -> list[Sample]:
+def samples(view: LoadedRecording, params: Params) -> list[Sample]:
     """The first tick, one within, and the last."""
     return cut_samples(view, params)
 
 
 @pytest.fixture
-def side_by_side(view: EpisodeView, samples: list[Sample], params: Params) -> Figure:
+def side_by_side(view: LoadedRecording, samples: list[Sample], params: Params) -> Figure:
     return draw_samples(view, samples, window_lengths(params))
 
 

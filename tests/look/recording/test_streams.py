@@ -11,18 +11,18 @@ from pipeline.base.config import Params
 from pipeline.base.text import Table
 from pipeline.data import Channels, Stream
 from pipeline.data.contact import force_columns
-from pipeline.look.recording.episode import EpisodeView
+from pipeline.look.recording.episode import LoadedRecording
 from pipeline.look.recording.streams import contacts, describe_channels, statistics_blocks
 from pipeline.simulation.insertion import TICK_HZ
-from pipeline.simulation.recorder import SimulatedEpisode, simulate_episode
+from pipeline.simulation.recorder import Demonstration, simulate_episode
 
-Look = Callable[..., EpisodeView]
+Look = Callable[..., LoadedRecording]
 PARAMS = Params.model_validate(
     {"data": {"sources": [{"name": "s", "path": "."}]}, "vlm": {"checkpoint": "none"}}
 )
 
 
-def table_of(view: EpisodeView) -> Table:
+def table_of(view: LoadedRecording) -> Table:
     (table,) = statistics_blocks(view, lambda *_: pytest.fail("draws nothing"), PARAMS)
     assert isinstance(table, Table)
     return table
@@ -57,26 +57,26 @@ def test_channels_that_differ_by_a_number_are_one_row(healthy: Path, look: Look)
 SEEDS = (20, 23)
 
 
-def depth_mm(episode: SimulatedEpisode, time_s: np.ndarray) -> np.ndarray:
+def depth_mm(episode: Demonstration, time_s: np.ndarray) -> np.ndarray:
     """How far the tip is below the undisturbed surface: contact where above 0."""
     knots = episode.insertion.knots
     depth = [knot.surface_mm - knot.pose[2] for knot in knots]
     return np.interp(time_s, np.arange(len(knots)) / TICK_HZ, depth)
 
 
-def view_of(look_at: EpisodeView, time: np.ndarray, values: np.ndarray, names=("force",)):
+def view_of(look_at: LoadedRecording, time: np.ndarray, values: np.ndarray, names=("force",)):
     channels = Channels(tuple(names), ("N",) * len(names))
     sensor = Stream(channels, time, np.asarray(values, np.float32).reshape(len(time), -1))
     return replace(look_at, sensor=sensor)
 
 
 @pytest.fixture(scope="module")
-def base(healthy: Path, look) -> EpisodeView:
+def base(healthy: Path, look) -> LoadedRecording:
     return look(healthy / "lerobot")
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-def test_contact_is_where_the_simulated_needle_touches(base: EpisodeView, seed: int) -> None:
+def test_contact_is_where_the_simulated_needle_touches(base: LoadedRecording, seed: int) -> None:
     episode = simulate_episode(seed, 0.0)
     time = episode.sensor_time
     view = view_of(base, time, episode.sensor[:, 0])
@@ -92,14 +92,16 @@ def test_contact_is_where_the_simulated_needle_touches(base: EpisodeView, seed: 
     assert contacts(view_of(base, time[before], episode.sensor[before, 0])) == []
 
 
-def test_contact_may_pull_and_may_be_sampled_slowly(base: EpisodeView) -> None:
+def test_contact_may_pull_and_may_be_sampled_slowly(base: LoadedRecording) -> None:
     time = np.arange(60) / 10
     force = 2.0 + np.random.default_rng(0).normal(0, 0.005, 60)
     force[30:45] -= 0.5
     assert contacts(view_of(base, time, force)) == [(time[30], time[45])]
 
 
-def test_contact_begins_where_the_force_rises_and_not_where_it_creeps(base: EpisodeView) -> None:
+def test_contact_begins_where_the_force_rises_and_not_where_it_creeps(
+    base: LoadedRecording,
+) -> None:
     time = np.arange(3000) / 500
     force = 2.0 + np.random.default_rng(0).normal(0, 0.002, 3000)
     force += np.clip(time - 1, 0, 3) * 0.04 / 3  # N of drift, under the threshold
@@ -115,7 +117,7 @@ def test_contact_of_a_real_insertion_begins_with_the_rise(shared_data: Path, loo
     assert 2.4 < start - view.zero < 2.6 and stop == view.sensor.time[-1]
 
 
-def test_wrenches_count_by_their_length(base: EpisodeView) -> None:
+def test_wrenches_count_by_their_length(base: LoadedRecording) -> None:
     rng = np.random.default_rng(0)
     time = np.arange(3000) / 500
     wrench = rng.normal([0.3, -9.8, 1.0], 0.01, (3000, 3))
@@ -125,7 +127,7 @@ def test_wrenches_count_by_their_length(base: EpisodeView) -> None:
     assert (start, stop) == pytest.approx((time[2000], time[2500]), abs=0.03)
 
 
-def test_no_force_no_contact(base: EpisodeView) -> None:
+def test_no_force_no_contact(base: LoadedRecording) -> None:
     assert contacts(replace(base, sensor=None)) == []
     view = view_of(base, np.arange(100) / 10, np.linspace(0, 9, 100), ("depth",))
     assert view.sensor is not None and force_columns(view.sensor.channels.names) == []

@@ -13,7 +13,7 @@ from torch import nn
 from pipeline.base.config import Params
 from pipeline.base.digests import file_digest
 from pipeline.base.errors import CheckpointMismatch, ConfigError
-from pipeline.base.source import read_tuned_on, tuned_on_of_store
+from pipeline.base.provenance import read_tuned_on, tuned_on_of_store
 from pipeline.extract import extract
 from pipeline.policy.checkpoint import find_policy, load_policy
 from pipeline.policy.encoders import FeaturePooler

@@ -24,7 +24,7 @@ from pipeline.base.text import duration, size
 from pipeline.data.episode import Embodiment
 from pipeline.extract.survey import CheckedEpisode, Survey
 from pipeline.store import FEATURES, RowSource, StoreBuild, part_path, read_plan
-from pipeline.store.border import gc_command
+from pipeline.store.documents import gc_command
 from pipeline.store.paths import KEPT, MERGED, builds_aside, previous_path, set_build_aside
 from pipeline.store.schema import ArraySpec, read_specs
 

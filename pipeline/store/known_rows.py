@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.base.errors import StoreIncomplete
-from pipeline.store.border import EpisodeText
 from pipeline.store.chunks import (
     check_chunks,
     find_damage,
@@ -18,6 +17,7 @@ from pipeline.store.chunks import (
     row_checksums,
     sealed_trailer,
 )
+from pipeline.store.documents import EpisodeText
 from pipeline.store.episodes import check_index, read_texts
 from pipeline.store.paths import laid_out_attributes
 from pipeline.store.schema import (

@@ -20,9 +20,9 @@ from zarr.codecs import BytesCodec, Crc32cCodec, ZstdCodec
 
 from pipeline.base.errors import StoreIncomplete
 from pipeline.base.files import disk_full_named, sync
-from pipeline.base.source import row_key
-from pipeline.store.border import FrameDocument, StoreAttributes, StoredGolden, store_border
+from pipeline.base.provenance import row_key
 from pipeline.store.chunks import check_metadata, note_metadata
+from pipeline.store.documents import FrameDocument, StoreAttributes, StoredGolden, store_border
 from pipeline.store.paths import group_attributes, laid_out_attributes
 from pipeline.store.schema import TRAILER_BYTES
 

@@ -22,7 +22,7 @@ from pipeline.base.config import Params
 from pipeline.base.errors import ConfigError, RecordingError
 from pipeline.base.files import fresh
 from pipeline.data.timeline import choose_action_rotation
-from pipeline.look.recording.episode import EpisodeView, view_episode
+from pipeline.look.recording.episode import LoadedRecording, view_episode
 from pipeline.look.subject import Subject
 from pipeline.store import Episode, FeatureStore
 from pipeline.store.schema import FEATURES
@@ -71,7 +71,7 @@ def _file_name(source: str, episode: str) -> str:
     return re.sub(r"[^\w.-]+", "_", f"{source}_{episode}") + ".rrd"
 
 
-def _write_recorded(path: Path, view: EpisodeView) -> Path:
+def _write_recorded(path: Path, view: LoadedRecording) -> Path:
     """The file of a recording; a part that cannot be read is left out."""
     log = _Log(path, view.recording.id, view.zero)
     for name, stream in view.shown.items():

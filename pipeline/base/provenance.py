@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import AfterValidator, Field, Strict, model_validator
 
-from pipeline.base.border import Border, Document, Text
+from pipeline.base.documents import Border, Document, Text
 from pipeline.base.errors import StoreIncomplete
 from pipeline.base.files import read_document, write_with_digest
 
@@ -168,7 +168,7 @@ Side = Literal["train", "val", "test"]
 SIDES: tuple[Side, ...] = ("train", "val", "test")
 
 
-class EpisodePart(Document):
+class SplitPart(Document):
     """The ticks of one episode on one side of a split."""
 
     ticks: Annotated[tuple[Tick, Tick], Strict(False)]
@@ -185,7 +185,7 @@ class EpisodePart(Document):
         return self
 
 
-class TunedPart(EpisodePart):
+class TunedPart(SplitPart):
     """The ticks of one episode that a model has seen."""
 
     episode: Text
@@ -199,7 +199,7 @@ class TunedOn(Document):
     val: Annotated[tuple[TunedPart, ...], Strict(False)] = ()
 
     @classmethod
-    def of_split(cls, split: Mapping[Side, Mapping[str, EpisodePart]]) -> "TunedOn":
+    def of_split(cls, split: Mapping[Side, Mapping[str, SplitPart]]) -> "TunedOn":
         """The train and val sides of a checkpoint's split."""
         parts = {
             side: [{"episode": name, **part.model_dump()} for name, part in split[side].items()]

@@ -49,9 +49,9 @@ from pipeline.base.errors import (
 )
 from pipeline.base.scheduler import client_of, private_cluster, quiet
 from pipeline.data.episode import RowFrames, by_episode
+from pipeline.extract.build_state import row_sources
 from pipeline.extract.engine import RowEngine, Speed
 from pipeline.extract.rows import FeatureBlock, Row, RowMarks, WrittenRows, row_frames
-from pipeline.extract.state import row_sources
 from pipeline.extract.survey import Survey
 from pipeline.store import FEATURES, RowSource, StoreBuild, part_path, read_plan
 from pipeline.store.schema import read_specs

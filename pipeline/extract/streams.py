@@ -12,11 +12,11 @@ from tqdm import tqdm
 from pipeline.base.arrays import first_non_finite
 from pipeline.base.errors import ConfigError, DiskFull, NumericsError
 from pipeline.base.files import free_bytes
-from pipeline.base.source import tuned_on_attributes
+from pipeline.base.provenance import tuned_on_attributes
 from pipeline.base.text import size
 from pipeline.data import Stream
 from pipeline.data.timeline import Timeline, tick_hz
-from pipeline.extract.state import store_bytes
+from pipeline.extract.build_state import store_bytes
 from pipeline.extract.survey import CheckedEpisode, Survey, embodiment_of
 from pipeline.store import FEATURES, SCHEMA, RowSource, Sizes, StoreBuild, arrays
 from pipeline.store.episodes import episode_arrays

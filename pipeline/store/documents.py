@@ -13,11 +13,11 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AliasPath, Field
 
-from pipeline.base.border import Border, Document, Text
-from pipeline.base.commands import command
 from pipeline.base.config import setting
+from pipeline.base.documents import Border, Document, Text
 from pipeline.base.errors import StoreIncomplete
-from pipeline.base.source import SlotDocument, SourceDocument, ViewName
+from pipeline.base.printed_commands import command
+from pipeline.base.provenance import SlotDocument, SourceDocument, ViewName
 
 Length = Annotated[int, Field(ge=0, le=2**48)]
 KNOWN = ".known"

@@ -9,8 +9,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from pipeline.base.commands import command
 from pipeline.base.errors import ConfigError
+from pipeline.base.printed_commands import command
 
 _ROOT = Path("/")
 _FILE_PAGES = ("inactive_file", "active_file")
