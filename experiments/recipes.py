@@ -75,11 +75,12 @@ SLOTS: dict[str, tuple[str, ...]] = {
     "tokens of two layers": ("vlm.pooling=[tokens]", _TWO_LAYERS),
     "int8": ("extract.dtype=int8",),
     "float8": ("extract.dtype=float8",),
+    "pca 32 in int8": ("extract.dtype={{pca: 32, then: int8}}",),
     "tokens in int8": ("vlm.pooling=[tokens]", "extract.dtype=int8"),
     "tokens of the vision tower": ("vlm.pooling=[tokens]", "vlm.layers=[vision]"),
 }
 """What a store keeps of the demo's recordings, beside the demo's own mean and grid."""
-EIGHT_BITS = ("int8", "float8")
+EIGHT_BITS = ("int8", "float8", "pca 32 in int8")
 
 
 def _store_of(name: str) -> Store:
@@ -340,7 +341,9 @@ TABLES = {
             "grid, pooler",
         )
     ),
-    "bytes": Table((AS_IT_IS, "int8", "float8", "tokens in int8, pooler", "history of 3")),
+    "bytes": Table(
+        (AS_IT_IS, *EIGHT_BITS, "tokens in int8, pooler", "history of 3"),
+    ),
     "model": Table((AS_IT_IS, "tuned model")),
     "tuned tokens": Table(("tokens, pooler", "tuned tokens, pooler")),
     "images": Table((AS_IT_IS, "larger images")),
