@@ -135,7 +135,7 @@ def simulated_time(monkeypatch: pytest.MonkeyPatch) -> SimulatedTime:
     """The clock of `run_robot`, so that a busy machine changes nothing: only sleeping moves it, and
     an answer comes when the policy's `latency_s` is over."""
     simulated = SimulatedTime()
-    for module in ("realtime", "readings", "process", "run_report"):
+    for module in ("realtime", "readings", "loop_process", "run_report"):
         monkeypatch.setattr(f"pipeline.robot.{module}.time", simulated)
     monkeypatch.setattr("pipeline.robot.realtime.PolicyThread", SimulatedThread)
     monkeypatch.setattr(gc, "collect", lambda: 0)  # a third of a second each, for nothing here

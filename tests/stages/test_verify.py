@@ -106,7 +106,7 @@ class TestCheckpoint:
         (tmp_path / "head" / "best" / "policy.json").write_text("{}")
         calls: list[tuple] = []
         spec = {"digest": "x"}
-        held = SimpleNamespace(source={"feature_spec": spec}, golden=(1, 2), step=9)
+        held = SimpleNamespace(source={"feature_spec": spec}, golden=(1, 2), step=9, basis=None)
         held.encoders = {"features": 1}
         held.policy = lambda: held
 
@@ -130,7 +130,7 @@ class TestCheckpoint:
             f"{tmp_path / 'other'} (step 9): 2 golden rows, cpu",
             "2 golden rows computed again",
         ]
-        ((checkpoint, (vlm, spec, device)),) = proved
+        ((checkpoint, (vlm, spec, device, _)),) = proved
         assert (spec, device) == (checkpoint.source["feature_spec"], "cpu")
         assert vlm.image_resize_height == 112
 
