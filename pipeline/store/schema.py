@@ -17,7 +17,7 @@ import numpy as np
 import zarr
 from zarr.codecs import BytesCodec, Crc32cCodec
 
-from pipeline.base.arrays import packed_size
+from pipeline.base.arrays import packed_dim, packed_size
 from pipeline.base.differences import differences
 from pipeline.base.documents import Border, shown
 from pipeline.base.projection import group_sizes
@@ -364,6 +364,10 @@ def check_agreement(
     wrong = [f"{at}: expected {n}, found {len(k)}" for at, (k, n) in pairs.items() if len(k) != n]
     if len(spec.slots) % spec.variants:
         wrong.append(f"feature_spec.variants: expected a divisor of {len(spec.slots)} slots")
+    held = specs[FEATURES]
+    dim = packed_dim(held.stored_dtype, held.shape[2])
+    if spec.dim not in (None, dim):
+        wrong.append(f"feature_spec.dim: expected {dim}, which {FEATURES} holds, found {spec.dim}")
     basis = BASIS in specs and specs[BASIS].shape
     if basis != (expected := _basis_shape(spec)):
         wrong.append(f"feature_spec.pca: expected the array {BASIS} {expected}, found {basis}")

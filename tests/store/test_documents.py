@@ -91,6 +91,7 @@ ROOT = {
     "feature_spec.views": ['["../x"]'],
     "feature_spec.slots": ["[1]", "[]"],
     "feature_spec.variants": ["10000000000"],
+    "feature_spec.dim": ["7"],
     "streams": ["{}"],
     "streams.sensor.names": ['["a"]'],
     "streams.views": ['["View1", "View2"]'],
