@@ -91,7 +91,7 @@ def _features(settings: tuple[str, ...], frames: list[Frames]) -> tuple[NDArray[
     """What the model would store (row, slot, dim), and its image tokens a row."""
     vlm = load_params(Path("params.yaml"), list(settings)).vlm
     spec = live_spec(vlm, VIEWS)
-    model = LiveFeatures(vlm, spec.document, str(resolve_device("auto")))
+    model = LiveFeatures(vlm, spec.document, str(resolve_device("auto")), None)
     parts = [frames[at : at + 64] for at in range(0, len(frames), 64)]
     told = [model(part, INSTRUCTION)[0].numpy() for part in tqdm(parts, "looking", disable=None)]
     height, width = spec.image_size

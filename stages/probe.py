@@ -56,7 +56,7 @@ def main(params: "Params") -> None:
         study = _timed(study, store, params)
     claim(wanted.output, REPORT)
     if study.codecs:
-        kept = write_proofs(store.path, store.spec, proofs(study))
+        kept = write_proofs(store.path, store.spec, proofs(study, store))
         print(f"{kept}: what these types lose, for extractions of the same features beside it")
     files = [
         *write_tables(wanted.output, study),

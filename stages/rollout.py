@@ -74,7 +74,8 @@ def _here(params: "Params", say: Callable[[str], None]) -> "Rollouts":
     folder = wanted.checkpoint or params.train_head.output
     checkpoint = load_policy(find_policy(folder))
     device = resolve_device(wanted.device)
-    load = partial(LiveFeatures, params.vlm, checkpoint.source["feature_spec"], str(device))
+    trained = checkpoint.source["feature_spec"]
+    load = partial(LiveFeatures, params.vlm, trained, str(device), checkpoint.basis)
     say(f"{folder} (step {checkpoint.step}), {_where(wanted)}, device {device}")
     return roll_out(checkpoint, str(folder), checkpoint.policy(device), load, wanted, say)
 

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
+from pipeline.base.errors import ConfigError
 from pipeline.base.projection import Basis, fit_map
 from pipeline.data.episode import RowFrames
 from pipeline.extract.encoder import Encoder
@@ -26,7 +27,8 @@ _BATCH = 8
 def fit_basis(surveyed: Survey, checked: Sequence[CheckedEpisode]) -> tuple[Basis, str]:
     """The basis of the projected features of these episodes, and a line for people about it.
 
-    Rows are evenly spread over all episodes. Raises what decoding and the model raise.
+    Rows are evenly spread over all episodes. Raises what decoding and the model raise, and
+    `ConfigError` where a group of slots has too few features to fit so many numbers.
     """
     spec = surveyed.spec.whole
     assert spec is not None, "only projected features have a basis"
@@ -47,16 +49,22 @@ def fit_basis(surveyed: Survey, checked: Sequence[CheckedEpisode]) -> tuple[Basi
     vlm = FrozenVLM.load(raw.vlm, whole, raw.extract.device)
     sample: list[list[NDArray[np.float32]]] = [[] for _ in whole.groups]
     with tqdm(None, "fit the basis", count, unit="row", disable=None) as bar:
-        for _, features in Encoder(vlm, _BATCH).encoded(ready):
-            for values in features:
-                groups = np.split(values, np.cumsum(whole.groups)[:-1])
-                for kept, group in zip(sample, groups, strict=True):
-                    turn = np.arange(min(len(group), _SLOTS_A_ROW)) + bar.n * _SLOTS_A_ROW
-                    kept.append(group[turn % len(group)])
-                bar.update()
-    # Zeros are of missing views.
+        encoded = (row for _, features in Encoder(vlm, _BATCH).encoded(ready) for row in features)
+        for number, values in enumerate(encoded):
+            groups = np.split(values, np.cumsum(whole.groups)[:-1])
+            for kept, group in zip(sample, groups, strict=True):
+                there = group[group.any(axis=1)]  # zeros are of missing views
+                turn = np.arange(min(len(there), _SLOTS_A_ROW)) + number * _SLOTS_A_ROW
+                kept.append(there[turn % max(1, len(there))])
+            bar.update()
     joined = [np.concatenate(kept) for kept in sample]
-    fitted = [fit_map(rows[rows.any(axis=1)], surveyed.spec.dim) for rows in joined]
+    if (fewest := min(map(len, joined))) <= surveyed.spec.dim:
+        raise ConfigError(
+            f"extract.dtype: {surveyed.spec.dim} numbers a slot are fitted to more features than "
+            f"that; a group of slots has {fewest} of them in {count} rows. Set a smaller pca, "
+            "extract more recordings first, or leave out a view that hardly any of them has."
+        )
+    fitted = [fit_map(features, surveyed.spec.dim) for features in joined]
     least = min(share for _, share in fitted)
     return Basis(np.stack([affine for affine, _ in fitted])), (
         f"basis of {surveyed.spec.dim} of {whole.dim} numbers a slot, fitted on {count} rows: "

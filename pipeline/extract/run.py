@@ -32,6 +32,7 @@ from pipeline.extract.survey import (
     survey,
 )
 from pipeline.store import FEATURES, FeatureStore, RowSource, StoreBuild, build_lock, recover
+from pipeline.store.documents import extract_command
 from pipeline.store.paths import refuse_foreign_store
 
 
@@ -108,6 +109,11 @@ def _survey(
         surveyed, checked = sound_episodes(surveyed, digests)  # lists everything that is wrong
         if repair and surveyed.spec.unfitted:  # the store's basis is damaged, too
             surveyed = _fitted(surveyed, checked, say)
+            if places.finished != surveyed.plan:
+                raise StoreMismatch(
+                    f"{places.target}: its basis is damaged and cannot be fitted again to the bit. "
+                    f"Run {extract_command(places.target)}: it fits another and computes every row"
+                )
         state = places.state(surveyed.plan, repair)
     if repair and places.finished != surveyed.plan:
         raise StoreMismatch(

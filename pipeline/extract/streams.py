@@ -25,7 +25,6 @@ from pipeline.store.proofs import PROOF, find_proof
 from pipeline.store.schema import BASIS, MOST_ROW_BYTES, ArraySpec
 from pipeline.vlm.checkpoint_folder import tuned_on
 from pipeline.vlm.feature_spec import FeatureSpec
-from pipeline.vlm.slots import layer_name
 
 
 def check_space(
@@ -94,6 +93,11 @@ def build_arrays(checked: Sequence[CheckedEpisode], survey: Survey) -> dict[str,
         input=0 if whole is None else whole.dim + 1,
     )
     specs = arrays(sizes, stored_as(extract.dtype), extract.sensor_dtype)
+    if BASIS in specs and (row_bytes := specs[BASIS].row_bytes) > MOST_ROW_BYTES:
+        raise ConfigError(
+            f"extract.dtype: the basis of a group would take {size(row_bytes)}, and no reader "
+            f"takes more than {size(MOST_ROW_BYTES)}. Set a smaller pca."
+        )
     if (row_bytes := specs[FEATURES].row_bytes) > MOST_ROW_BYTES:
         raise ConfigError(
             f"a row of features would take {size(row_bytes)}, and no reader takes more than "
@@ -172,6 +176,5 @@ def _attributes(checked: Sequence[CheckedEpisode], survey: Survey) -> dict[str, 
 
 def _proof(survey: Survey) -> dict[str, Any]:
     """The attribute with what a probe found that this type of storage loses, if one did."""
-    groups = {f"{layer_name(slot.layer, slot.norm)}, {slot.pooling}" for slot in survey.spec.slots}
-    proof = find_proof(survey.target.parent, survey.spec.document, groups)
+    proof = find_proof(survey.target.parent, survey.spec.document)
     return {} if proof is None else {PROOF: proof.model_dump(mode="json")}

@@ -37,7 +37,7 @@ class LiveFeatures:
     """The frozen model of `vlm`, which computes a policy's features from live frames."""
 
     def __init__(
-        self, vlm: VLMParams, trained: Mapping[str, Any], device: str, basis: Basis | None = None
+        self, vlm: VLMParams, trained: Mapping[str, Any], device: str, basis: Basis | None
     ) -> None:
         """Load the model; `trained` and `basis` are those of the policy's checkpoint.
 

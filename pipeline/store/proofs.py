@@ -6,8 +6,9 @@ features into that type, in the same folder, copies the verdict into its store.
 
 import hashlib
 import json
-from collections.abc import Collection, Mapping
+from collections.abc import Iterable, Mapping
 from contextlib import suppress
+from itertools import groupby
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -27,6 +28,8 @@ class Loss(Document):
 
     of: Text
     """The group."""
+    slots: Text
+    """`slots_digest` of its slots."""
     r2: float
     """R^2 of the action with this type, minus that with the features in float32."""
     low: float | None = None
@@ -38,6 +41,8 @@ class Loss(Document):
 class Proof(Document):
     """The verdict on one type, from so many recordings."""
 
+    store: Text
+    """The name of the store that was probed."""
     recordings: Annotated[int, Field(ge=0)]
     ticks: Annotated[int, Field(ge=0)]
     losses: list[Loss]
@@ -46,8 +51,8 @@ class Proof(Document):
         worst = min(self.losses, key=lambda loss: loss.r2)
         ends = "" if worst.low is None else f" ({worst.low:+.4f} to {worst.high:+.4f})"
         return (
-            f"a probe of {self.recordings} recordings found {worst.r2:+.4f}{ends} in R2 beside "
-            f"float32, at worst ({worst.of})"
+            f"a probe of {self.recordings} recordings of {self.store} found {worst.r2:+.4f}{ends} "
+            f"in R2 beside float32, at worst ({worst.of})"
         )
 
 
@@ -66,6 +71,13 @@ def features_digest(spec: Mapping[str, Any]) -> str:
     if "pca" in spec:
         kept["dim"] = spec["pca"]["of"]
     text = json.dumps(kept, sort_keys=True)
+    return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
+
+
+def slots_digest(slots: Iterable[Mapping[str, Any]]) -> str:
+    """The digest of the documents of a group's slots."""
+    plain = [{k: v for k, v in slot.items() if k != "variant"} for slot in slots]
+    text = json.dumps(plain, sort_keys=True)
     return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
 
 
@@ -89,14 +101,16 @@ def write_proofs(store: Path, spec: Mapping[str, Any], types: Mapping[str, Proof
     return path
 
 
-def find_proof(folder: Path, spec: Mapping[str, Any], groups: Collection[str]) -> Proof | None:
-    """The verdict in a folder of stores on how these groups of features of a spec are stored."""
+def find_proof(folder: Path, spec: Mapping[str, Any]) -> Proof | None:
+    """The verdict in a folder of stores on how all groups of slots of a spec are stored."""
+    named = groupby(spec["slots"], lambda slot: (slot["layer"], slot["norm"], slot["pooling"]))
+    groups = {slots_digest(slots) for _, slots in named}
     features, name = features_digest(spec), stored_name(spec)
     for path in sorted(folder.glob(f"*.zarr{SUFFIX}")):
         proofs = _read(path)
         if proofs is not None and proofs.features == features and name in proofs.types:
             proof = proofs.types[name]
-            losses = [loss for loss in proof.losses if loss.of in groups]
+            losses = [loss for loss in proof.losses if loss.slots in groups]
             if len(losses) == len(groups):
                 return proof.model_copy(update={"losses": losses})
     return None

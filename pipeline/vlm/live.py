@@ -116,8 +116,9 @@ class LiveVLM(nn.Module):
             # Image tokens are written into the embeddings in place, which a leaf that requires
             # gradients would refuse; non-reentrant checkpoints need no such input.
             inner.disable_input_require_grads()
+        model = model.to(target)  # before the extractor, which puts the basis beside it
         extractor = Extractor(inner, PixelSettings.of(vlm), spec.slots, basis=spec.basis)
-        return cls(model.to(target), extractor, spec, vlm, tuning)
+        return cls(model, extractor, spec, vlm, tuning)
 
     def forward(
         self, rows: Sequence[PreparedRow]

@@ -2,13 +2,15 @@
 
 import shutil
 from contextlib import closing
+from itertools import groupby
 
 import numpy as np
 import pytest
+from tqdm import tqdm
 
 from pipeline.base.arrays import widen
 from pipeline.base.digests import ContentDigests
-from pipeline.base.errors import VLMError
+from pipeline.base.errors import ConfigError, VLMError
 from pipeline.base.projection import apply_map
 from pipeline.extract import extract
 from pipeline.extract.basis import fit_basis
@@ -19,37 +21,39 @@ from pipeline.store.archive import archive, restore
 from pipeline.store.chunks import read_rows
 from pipeline.store.inventory import describe_stores, list_stores
 from pipeline.store.merging import merge
-from pipeline.store.proofs import Loss, Proof, proof_of, write_proofs
+from pipeline.store.proofs import Loss, Proof, proof_of, slots_digest, write_proofs
 from pipeline.store.schema import BASIS, read_spec
 from pipeline.store.verification import verify
 
 from .conftest import contents, run
 
-PROJECTED = {"dtype": {"pca": 24, "then": "int8"}}
+PROJECTED = {"dtype": {"pca": 12, "then": "int8"}}
 
 
 @pytest.fixture
 def projected(changed, extracted, tmp_path):
-    """Params of a store with 24 numbers a slot; beside it lies one in float32."""
+    """Params of a store with 12 numbers a slot; beside it lies one in float32."""
     params = changed(extract={"store": str(tmp_path / "stores" / "few.zarr"), **PROJECTED})
     return params, FeatureStore.open(tmp_path / "stores" / "made.zarr")
 
 
 def test_rows_are_the_projected_features(projected):
     params, whole = projected
-    groups = [f"layer 3, {pooling}" for pooling in ("mean", "image_mean", "view_mean")]
-    losses = [Loss(of=group, r2=-0.01, error_std=0.02) for group in groups]
-    proof = Proof(recordings=3, ticks=60, losses=losses)
-    write_proofs(whole.path, whole.spec, {"pca 24 in int8": proof})
+    losses = [
+        Loss(of="a group", slots=slots_digest(slots), r2=-0.01, error_std=0.02)
+        for _, slots in groupby(whole.spec["slots"], lambda slot: slot["pooling"])
+    ]
+    proof = Proof(store="made.zarr", recordings=3, ticks=60, losses=losses)
+    write_proofs(whole.path, whole.spec, {"pca 12 in int8": proof})
     report, lines = run(params)
     store = FeatureStore.open(params.extract.store)
     assert report.computed == len(whole.array("vl/time"))
-    assert any(line.startswith("basis of 24 of 128 numbers a slot") for line in lines)
-    assert store.feature_shape == (whole.feature_shape[0], 24)
+    assert any(line.startswith("basis of 12 of 128 numbers a slot") for line in lines)
+    assert store.feature_shape == (whole.feature_shape[0], 12)
     assert verify(store.path).sound
     assert proof_of(store.attrs) == proof
     listed = "\n".join(describe_stores(path := store.path.parent, list_stores(path), {}))
-    assert "x 24 (PCA of 128) in int8" in listed
+    assert "x 12 (PCA of 128) in int8" in listed
     assert f"as it is stored, {proof}" in listed
     values, full = widen(store.array("vl/features")), whole.array("vl/features")
     valid = whole.array("vl/slot_valid").astype(bool)
@@ -63,12 +67,21 @@ def test_rows_are_the_projected_features(projected):
         assert spread[0] > 0.8
 
 
-def test_the_same_recordings_give_the_same_basis_to_the_bit(projected):
+def test_the_same_recordings_give_the_same_basis_to_the_bit(projected, monkeypatch):
     params, _ = projected
     with closing(ContentDigests(None)) as digests:
         surveyed, checked = sound_episodes(survey(params, digests), digests)
-    one, two = (fit_basis(surveyed, checked)[0] for _ in range(2))
+    one, _ = fit_basis(surveyed, checked)
+
+    def shown(*given, **options):
+        return tqdm(*given, **options | {"disable": False})  # as on a terminal
+
+    monkeypatch.setattr("pipeline.extract.basis.tqdm", shown)
+    two, _ = fit_basis(surveyed, checked)
     assert one.maps.tobytes() == two.maps.tobytes()
+    monkeypatch.setattr("pipeline.extract.basis.SAMPLE_ROWS", 6)
+    with pytest.raises(ConfigError, match=r"has 6 of them in 6 rows\. Set a smaller pca"):
+        fit_basis(surveyed, checked)
 
 
 def test_a_basis_outlives_a_kill_new_recordings_damage_and_copies(
@@ -146,7 +159,7 @@ def test_augmented_variants_share_the_basis(changed, tmp_path):
     params = changed(vlm=vlm, extract={"store": str(tmp_path / "two.zarr"), **PROJECTED})
     run(params)
     store = FeatureStore.open(params.extract.store)
-    assert store.basis.maps.shape == (1, 129, 24)
+    assert store.basis.maps.shape == (1, 129, 12)
     assert store.array("vl/features").shape[1] == 2
     assert widen(store.array("vl/features"))[:, 1].any(axis=1).all()
 

@@ -36,7 +36,7 @@ def test_live_features_are_the_stored_ones(params: Params) -> None:
         shown = np.searchsorted(camera.time, times[rows, place])
         for views, image in zip(frames, camera.read(shown.tolist()), strict=True):
             views[view] = image
-    live = LiveFeatures(params.vlm, store.spec, "cpu")
+    live = LiveFeatures(params.vlm, store.spec, "cpu", None)
     features, valid = live(frames, recording.instruction)
     np.testing.assert_allclose(features, store.array("vl/features")[rows], atol=2e-5)
     assert valid.all()
@@ -53,19 +53,19 @@ def test_another_model_is_refused_before_a_weight_is_loaded(params, tmp_path, mo
     save_file(tensors | {name: tensors[name] * 1.5}, weights, {"format": "pt"})
     vlm = params.vlm.model_copy(update={"checkpoint": str(other)})
     with pytest.raises(CheckpointMismatch, match=r"weights: .* -> "):
-        LiveFeatures(vlm, trained, "cpu")
+        LiveFeatures(vlm, trained, "cpu", None)
 
 
 def test_the_key_of_frames_is_that_of_the_policys_store(params: Params) -> None:
     store = FeatureStore.open(params.extract.store)
-    live = LiveFeatures(params.vlm, store.spec, "cpu")
+    live = LiveFeatures(params.vlm, store.spec, "cpu", None)
     for row in store.golden:
         assert live.key(row.frames, row.instruction) == row.key
 
 
 @pytest.fixture
 def live(params: Params, checkpoint: PolicyCheckpoint) -> LiveFeatures:
-    return LiveFeatures(params.vlm, checkpoint.source["feature_spec"], "cpu")
+    return LiveFeatures(params.vlm, checkpoint.source["feature_spec"], "cpu", None)
 
 
 def refusal(checkpoint: PolicyCheckpoint, live: LiveFeatures) -> str:
@@ -105,7 +105,7 @@ class TestProven:
 
     def test_another_attention_backend(self, checkpoint, params):
         vlm = params.vlm.model_copy(update={"attention": "eager"})
-        live = LiveFeatures(vlm, checkpoint.source["feature_spec"], "cpu")
+        live = LiveFeatures(vlm, checkpoint.source["feature_spec"], "cpu", None)
         assert 0 < proven(checkpoint, live)[1] < TOLERANCES["float32"] / 10
 
     def test_without_golden_rows_there_is_a_warning(self, checkpoint, live):
@@ -181,7 +181,7 @@ def test_a_checkpoint_carries_the_basis_on_which_live_features_are_projected(
     prove(checkpoint, live, said.append)
     assert "golden rows computed again" in said[0]
     with pytest.raises(CheckpointMismatch, match="pca"):
-        LiveFeatures(params.vlm, checkpoint.source["feature_spec"], "cpu")
+        LiveFeatures(params.vlm, checkpoint.source["feature_spec"], "cpu", None)
 
     save_file({"maps": torch.from_numpy(checkpoint.basis.maps + 1)}, folder / BASIS)
     with pytest.raises(CheckpointIncomplete, match="its digest is not"):

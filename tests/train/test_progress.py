@@ -93,11 +93,12 @@ def test_a_lossy_store_is_named_with_the_proof(store, params, monkeypatch):
     monkeypatch.setattr(type(store), "spec", property(lambda own: lossy))
     lines = describe_data(store, shape, params(), split)
     assert any("stored in int8; stages.probe with probe.codecs" in line for line in lines)
-    loss = {"of": "layer 3, mean", "r2": -0.01, "low": -0.02, "high": 0.005, "error_std": 0.1}
-    proof = {"recordings": 24, "ticks": 90, "losses": [loss]}
+    loss = {"of": "mean", "slots": "x", "r2": -0.01, "low": -0.02, "high": 0.005}
+    loss["error_std"] = 0.1
+    proof = {"store": "whole.zarr", "recordings": 24, "ticks": 90, "losses": [loss]}
     monkeypatch.setattr(store, "attrs", {**store.attrs, "proof": proof})
     lines = describe_data(store, shape, params(), split)
-    said = "stored in int8; a probe of 24 recordings found -0.0100 (-0.0200 to +0.0050) in R2"
+    said = "stored in int8; a probe of 24 recordings of whole.zarr found -0.0100 (-0.0200 to"
     assert any(said in line for line in lines)
 
 

@@ -29,6 +29,7 @@ from pipeline.evaluate.probe.inputs import (
 from pipeline.evaluate.probe.ridge import ProbeFolds, ProbeScore, cross_validate, fold_by_recording
 from pipeline.policy.normalization import fit_channels
 from pipeline.store import FEATURES, FeatureStore
+from pipeline.store.proofs import stored_name
 from pipeline.train.batches import evenly
 from pipeline.train.statistics import check_finite
 
@@ -144,7 +145,7 @@ def probe(store: FeatureStore, params: ProbeParams) -> ProbeStudy:
     Raises `StoreMismatch` where fewer than two recordings are long enough, and `NumericsError` on
     NaN or inf, naming the place.
     """
-    stored = store.spec.get("storage_dtype", "float32")
+    stored = stored_name(store.spec)
     if params.codecs and stored != "float32":
         raise StoreMismatch(
             f"probe.codecs: expected a store in float32, from which other types are judged, found "

@@ -9,7 +9,8 @@ import numpy as np
 from pipeline.base.files import write_document
 from pipeline.base.text import Table
 from pipeline.evaluate.probe.study import ProbeResult, ProbeStudy, depth, ranked, recommend
-from pipeline.store.proofs import Loss, Proof
+from pipeline.store import FeatureStore
+from pipeline.store.proofs import Loss, Proof, slots_digest
 
 TOP = 12
 """The most slots that are printed; the tables have all."""
@@ -108,15 +109,20 @@ def codec_table(study: ProbeStudy) -> Table:
     return Table(heads, rows)
 
 
-def proofs(study: ProbeStudy) -> dict[str, Proof]:
-    """The verdict on each codec, for the file beside the store."""
+def proofs(study: ProbeStudy, store: FeatureStore) -> dict[str, Proof]:
+    """The verdict on each codec, for the file beside the store that was probed."""
     losses: dict[str, list[Loss]] = {}
     for result in study.codecs:
         figures = {"error_std": result.error, **result.difference.document("r2")}
-        loss = Loss.model_validate({"of": result.of.name.label, **figures})
+        slots = slots_digest(store.attrs["slots"][slot] for slot in result.of.slots)
+        of_group = {"of": result.of.name.group.label, "slots": slots}
+        loss = Loss.model_validate({**of_group, **figures})
         losses.setdefault(result.codec, []).append(loss)
-    of = {"recordings": study.folds.recordings, "ticks": len(study.folds.ticks)}
-    return {codec: Proof(**of, losses=own) for codec, own in losses.items()}
+    recordings, ticks = study.folds.recordings, len(study.folds.ticks)
+    return {
+        codec: Proof(store=store.path.name, recordings=recordings, ticks=ticks, losses=own)
+        for codec, own in losses.items()
+    }
 
 
 def notes(study: ProbeStudy) -> list[str]:
