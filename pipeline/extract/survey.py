@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
-from pipeline.base.config import DataParams, ExtractParams, Params, VLMParams
+from pipeline.base.config import PCA, DataParams, ExtractParams, Params, VLMParams
 from pipeline.base.digests import ContentDigests, joint_digest
 from pipeline.base.documents import Border
 from pipeline.base.errors import RecordingError, StoreMismatch, VLMError
@@ -27,7 +27,7 @@ from pipeline.data import BadEpisode, Recording, content_digest, open_recordings
 from pipeline.data.episode import Embodiment, common_embodiment, read_episode
 from pipeline.data.recording import absolute
 from pipeline.data.timeline import ActionRotation, choose_action_rotation
-from pipeline.store.basis import known_basis
+from pipeline.store.basis import basis_of, known_basis
 from pipeline.store.documents import EpisodeText
 from pipeline.store.episodes import EpisodeRows
 from pipeline.vlm.feature_spec import FeatureSpec, feature_spec
@@ -158,9 +158,17 @@ def _spec_and_plan(
     """The feature spec and the plan digest of a store of these episodes."""
     views = sorted({view for episode in episodes for view in episode.views})
     spec = feature_spec(vlm, extract.dtype, views, digests.of, digests.text)
-    if spec.unfitted and (known := known_basis(extract.store, spec.document)):
+    if spec.unfitted and (known := _known_basis(spec, extract)):
         spec = spec.on(known)
     return spec, _plan(spec, data, extract, episodes)
+
+
+def _known_basis(spec: FeatureSpec, extract: ExtractParams) -> Basis | None:
+    """The basis of the store that the params name, else of what lies at the target."""
+    if not isinstance(extract.dtype, PCA) or extract.dtype.basis is None:
+        return known_basis(extract.store, spec.document)
+    assert spec.whole is not None
+    return basis_of(extract.dtype.basis, (len(spec.groups), spec.whole.dim + 1, spec.dim))
 
 
 def _plan(

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.base.errors import StoreIncomplete
+from pipeline.base.errors import ConfigError, StoreIncomplete
 from pipeline.base.projection import Basis
 from pipeline.store.chunks import read_rows
 from pipeline.store.documents import store_border
@@ -39,6 +39,23 @@ def known_basis(target: Path, spec: Mapping[str, Any]) -> Basis | None:
             with suppress(StoreIncomplete):
                 return checked_basis(place, digest, read_rows(place, read_spec(place, BASIS)))
     return None
+
+
+def basis_of(store: Path, shape: tuple[int, int, int]) -> Basis:
+    """The basis of a store that the user names.
+
+    Raises `ConfigError` where it has none of this shape (group, channel + 1, rank), and
+    `StoreIncomplete` where it is damaged.
+    """
+    stored = group_attributes(store).get("feature_spec", {}).get("pca")
+    spec = read_spec(store, BASIS) if stored else None
+    if spec is None or spec.shape != shape:
+        raise ConfigError(
+            f"extract.dtype.basis: expected a store whose features are projected, with a basis of "
+            f"the shape {shape}, found {spec.shape if spec else 'none'} in {store}. Name another, "
+            "or set it to null."
+        )
+    return checked_basis(store, stored["basis"], read_rows(store, spec))
 
 
 def _plain(spec: Mapping[str, Any]) -> dict[str, Any]:

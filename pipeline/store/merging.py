@@ -252,7 +252,8 @@ def _check_alike(stores: Sequence[FeatureStore]) -> None:
                 f"{stores[0].path} and {store.path} cannot become one store, which has one feature "
                 "spec and one embodiment; there they differ (first -> second):\n  "
                 + "\n  ".join(describe(differing))
-                + "\nExtract one of them again as the other was, or keep two stores."
+                + "\nExtract one of them again as the other was (extract.dtype's basis names the "
+                "store whose basis is taken), or keep two stores."
             )
         agreed = form | agreed
 

@@ -1,6 +1,5 @@
 """Projected features: one basis for all rows of a store, whoever computes or takes them."""
 
-import shutil
 from contextlib import closing
 from itertools import groupby
 
@@ -134,14 +133,23 @@ def test_a_damaged_basis_is_fitted_again(projected):
     assert verify(store).sound
 
 
-def test_stores_of_one_basis_are_merged(projected, changed, tmp_path):
-    params, _ = projected
+def test_stores_of_one_basis_are_merged(projected, changed, monkeypatch, tmp_path):
+    params, whole = projected
     run(params)
-    copy = tmp_path / "stores" / "copy.zarr"
-    shutil.copytree(params.extract.store, copy)
-    merge([params.extract.store, copy], tmp_path / "stores" / "merged.zarr")
+    first, second = params.extract.store, tmp_path / "stores" / "second.zarr"
+    monkeypatch.setattr("pipeline.extract.basis.fit_basis", None)  # nothing fits one from here on
+
+    def on(basis):
+        dtype = PROJECTED["dtype"] | {"basis": str(basis)}
+        return changed(extract={"store": str(second), "dtype": dtype})
+
+    for other in (whole.path, tmp_path / "nowhere.zarr"):
+        with pytest.raises(ConfigError, match=r"extract\.dtype\.basis: .* found none"):
+            run(on(other))
+    run(on(first))
+    merge([first, second], tmp_path / "stores" / "merged.zarr")
     merged = FeatureStore.open(tmp_path / "stores" / "merged.zarr")
-    assert merged.basis.digest == FeatureStore.open(copy).basis.digest
+    assert merged.basis.digest == FeatureStore.open(first).basis.digest
     assert verify(merged.path).sound
 
 

@@ -40,6 +40,9 @@ class PCA(Section):
     """How many; at most the width of the model's hidden states."""
     then: StorageDtype = "int8"
     """The type in which they are stored."""
+    basis: Place | None = None
+    """A store whose directions are taken, so that the two can be merged, or a policy be judged on
+    both; null: those of the store at `extract.store`, or new ones."""
 
     def __str__(self) -> str:
         return f"pca {self.pca} in {self.then}"
