@@ -21,8 +21,7 @@ from pathlib import Path
 from typing import Any
 from unittest.mock import patch
 
-from benchmarks.formats import evict
-from benchmarks.stores import write_store
+from benchmarks.stores import evict, write_store
 from benchmarks.timing import Work, arguments, at_least, at_most, race, report
 from benchmarks.train_step import SMALL, Contender
 from pipeline.base.config import TrainHeadParams, load_params

@@ -1,6 +1,5 @@
 """The same rows in the formats that people keep them in, and one way each to read a batch."""
 
-import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -89,21 +88,6 @@ def file_readers(folder: Path, samples: NDArray[Any]) -> dict[str, Read]:
         return torch.stack([torch.load(folder / f"{row}.pt") for row in rows])
 
     return {".npy a sample": npy, ".pt a sample": pt}
-
-
-def evict(folder: Path) -> None:
-    """Drop the clean pages of all files below `folder` from the page cache.
-
-    Pages that a process maps stay, so nothing may have the files mapped.
-    """
-    for path in folder.rglob("*"):
-        if path.is_file():
-            descriptor = os.open(path, os.O_RDONLY)
-            try:
-                os.fdatasync(descriptor)
-                os.posix_fadvise(descriptor, 0, 0, os.POSIX_FADV_DONTNEED)
-            finally:
-                os.close(descriptor)
 
 
 def _one_file(path: Path, values: NDArray[Any]) -> tuple[Any, NDArray[Any]]:

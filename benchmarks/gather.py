@@ -35,9 +35,8 @@ from benchmarks.contests import (
     row_race,
     window_race,
 )
-from benchmarks.formats import evict
 from benchmarks.loading import stream_rates
-from benchmarks.stores import write_store
+from benchmarks.stores import evict, write_store
 from benchmarks.timing import Race, Work, arguments, at_least, at_most, race, report
 from pipeline.store import FeatureStore
 from pipeline.store import gather as gathering

@@ -1,6 +1,7 @@
 """Large synthetic stores, written by the project's own writer."""
 
 import json
+import os
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -168,3 +169,18 @@ def _random_rows(spec: ArraySpec) -> NDArray[np.generic]:
     rows = min(spec.shape[0], max(1, _BLOCK_BYTES // spec.row_bytes))
     rng = np.random.default_rng(0)
     return rng.standard_normal((rows, *spec.shape[1:]), np.float32).astype(spec.dtype)
+
+
+def evict(folder: Path) -> None:
+    """Drop the clean pages of all files below `folder` from the page cache.
+
+    Pages that a process maps stay, so nothing may have the files mapped.
+    """
+    for path in folder.rglob("*"):
+        if path.is_file():
+            descriptor = os.open(path, os.O_RDONLY)
+            try:
+                os.fdatasync(descriptor)
+                os.posix_fadvise(descriptor, 0, 0, os.POSIX_FADV_DONTNEED)
+            finally:
+                os.close(descriptor)
