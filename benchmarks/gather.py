@@ -167,8 +167,9 @@ def codes(
     folder: Path, sizes: Mapping[str, Any], options: argparse.Namespace
 ) -> tuple[dict[str, Any], dict[str, Any], list[dict[str, Any]]]:
     """Rows of 49 slots of 128 numbers in int8, which with their scales take 136 bytes each."""
-    narrow = {"readings": 200, "states": 200, "channels": 16, "slots": 49, "dim": 128}
-    length = {"episodes": 2 if options.quick else 40, "ticks": 3750}
+    narrow: dict[str, Any] = {"readings": 200, "states": 200, "channels": 16, "slots": 49}
+    narrow["dim"] = 128
+    length: dict[str, Any] = {"episodes": 2 if options.quick else 40, "ticks": 3750}
     store = FeatureStore.open(write_store(folder / "codes.zarr", **narrow, **length, dtype="int8"))
     found = code_race(store, sizes, options.rounds or (2 if options.quick else 15))
     ceiling = min(CEILINGS, key=found.median)

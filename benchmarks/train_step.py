@@ -90,7 +90,7 @@ def main() -> None:
 
 def make_trainer(folder: Path, sizes: dict[str, int], device: str, quick: bool) -> Trainer:
     """A trainer of the default head on a new store below `folder`."""
-    streams = {name: size for name, size in sizes.items() if name != "steps"}
+    streams: dict[str, Any] = {name: size for name, size in sizes.items() if name != "steps"}
     store = FeatureStore.open(write_store(folder / "steps.zarr", dtype="float32", **streams))
     changed = {"device": device, "output": folder / "head", "logs": folder / "logs"}
     given = load_params(Path("params.yaml")).train_head.model_dump()
