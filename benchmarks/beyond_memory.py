@@ -10,6 +10,7 @@ drop. For a limit that the kernel enforces, run it under `systemd-run --scope -p
 """
 
 import ctypes
+import mmap
 import shutil
 import statistics
 import tempfile
@@ -38,7 +39,6 @@ QUICK: dict[str, Any] = {"tokens": (2, 2), "dim": 16, "ticks": 60}
 ROWS_IN_RAM = 400
 READER = {"feature_encoder": {"kind": "pooler"}}
 _REUSE, _CHANNELS = 3, 16
-_MADV_DONTNEED = 4
 _LIBC = ctypes.CDLL(None, use_errno=True)
 _LIBC.madvise.argtypes = (ctypes.c_void_p, ctypes.c_size_t, ctypes.c_int)
 _ENDLESS = range(10**9)
@@ -164,7 +164,7 @@ def _contender(trainer: Trainer, steps: int, stack: ExitStack) -> Contender:
 def _drop(store: FeatureStore) -> None:
     """Take the features out of memory: first from the map, then from the kernel's cache."""
     features = store.array(FEATURES)
-    if _LIBC.madvise(features.ctypes.data, features.nbytes, _MADV_DONTNEED):
+    if _LIBC.madvise(features.ctypes.data, features.nbytes, mmap.MADV_DONTNEED):
         raise OSError(ctypes.get_errno(), "madvise")
     evict(store.path / FEATURES)
 

@@ -38,10 +38,15 @@ class Basis:
         return hasher.hexdigest()
 
 
+def slot_groups(slots: Sequence[Mapping[str, Any]]) -> list[list[Mapping[str, Any]]]:
+    """The slot documents of one variant by layer, norm and pooling, in order."""
+    named = groupby(slots, lambda slot: (slot["layer"], slot["norm"], slot["pooling"]))
+    return [[*group] for _, group in named]
+
+
 def group_sizes(slots: Sequence[Mapping[str, Any]]) -> tuple[int, ...]:
     """How many slots each group has, of the slot documents of one variant, in order."""
-    named = groupby((slot["layer"], slot["norm"], slot["pooling"]) for slot in slots)
-    return tuple(len([*group]) for _, group in named)
+    return tuple(map(len, slot_groups(slots)))
 
 
 def fit_map(values: NDArray[np.floating[Any]], rank: int) -> tuple[NDArray[np.float32], float]:

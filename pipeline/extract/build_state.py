@@ -16,6 +16,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
 
+from pipeline.base.config import PCA
 from pipeline.base.differences import describe, differences
 from pipeline.base.digests import ContentDigests
 from pipeline.base.errors import StoreIncomplete, StoreMismatch
@@ -231,7 +232,7 @@ def plan_lines(
         time = f"about {duration(left / rows_per_s)} at {rows_per_s:.1f} rows/s, as last measured"
     needed, free = size(store_bytes(build.specs)), size(free_bytes(build.part))
     if surveyed.spec.basis is not None and state == "new":
-        reasons.append("the basis of the store or build there is kept, so that its rows stay known")
+        reasons.append(_basis_line(surveyed))
     return [
         *(f"WARNING: {warning}" for warning in _warnings(surveyed)),
         *(f"why: {reason}" for reason in reasons),
@@ -248,6 +249,14 @@ def plan_lines(
 def store_bytes(specs: dict[str, ArraySpec]) -> int:
     """Bytes of all rows of a store."""
     return sum(spec.data_bytes for spec in specs.values())
+
+
+def _basis_line(surveyed: Survey) -> str:
+    """Whose basis a new build takes."""
+    dtype = surveyed.extract.dtype
+    if isinstance(dtype, PCA) and dtype.basis is not None:
+        return f"the basis of {dtype.basis} is taken"
+    return "the basis of the store or build there is kept, so that its rows stay known"
 
 
 def _reasons(surveyed: Survey, before: RowSource) -> Iterator[str]:

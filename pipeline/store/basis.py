@@ -34,10 +34,9 @@ def known_basis(target: Path, spec: Mapping[str, Any]) -> Basis | None:
     places = [part_path(target), *builds_aside(target), target]
     for place in [*places, *([previous] if KEPT.owns(previous) else [])]:
         stored = group_attributes(place).get("feature_spec", {})
-        digest = stored.get("pca", {}).get("basis")
-        if digest and _plain(stored) == _plain(spec):
+        if "pca" in stored and _plain(stored) == _plain(spec):
             with suppress(StoreIncomplete):
-                return checked_basis(place, digest, read_rows(place, read_spec(place, BASIS)))
+                return _read(place, stored["pca"].get("basis", ""))
     return None
 
 
@@ -47,15 +46,19 @@ def basis_of(store: Path, shape: tuple[int, int, int]) -> Basis:
     Raises `ConfigError` where it has none of this shape (group, channel + 1, rank), and
     `StoreIncomplete` where it is damaged.
     """
-    stored = group_attributes(store).get("feature_spec", {}).get("pca")
-    spec = read_spec(store, BASIS) if stored else None
-    if spec is None or spec.shape != shape:
+    stored = group_attributes(store).get("feature_spec", {})
+    basis = _read(store, stored["pca"].get("basis", "")) if "pca" in stored else None
+    if basis is None or basis.maps.shape != shape:
         raise ConfigError(
             f"extract.dtype.basis: expected a store whose features are projected, with a basis of "
-            f"the shape {shape}, found {spec.shape if spec else 'none'} in {store}. Name another, "
-            "or set it to null."
+            f"the shape {shape}, found {basis.maps.shape if basis else 'none'} in {store}. Name "
+            "another, or set it to null."
         )
-    return checked_basis(store, stored["basis"], read_rows(store, spec))
+    return basis
+
+
+def _read(root: Path, digest: str) -> Basis:
+    return checked_basis(root, digest, read_rows(root, read_spec(root, BASIS)))
 
 
 def _plain(spec: Mapping[str, Any]) -> dict[str, Any]:

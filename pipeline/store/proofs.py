@@ -4,19 +4,19 @@
 features into that type, in the same folder, copies the verdict into its store.
 """
 
-import hashlib
 import json
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
-from itertools import groupby
 from pathlib import Path
 from typing import Annotated, Any
 
 from pydantic import Field
 
+from pipeline.base.digests import joint_digest
 from pipeline.base.documents import Document, Text
 from pipeline.base.errors import CheckpointIncomplete
 from pipeline.base.files import OutputKind, read_document, refuse_foreign, write_with_digest
+from pipeline.base.projection import slot_groups
 
 SUFFIX = ".proofs.json"
 PROOF = "proof"
@@ -70,15 +70,13 @@ def features_digest(spec: Mapping[str, Any]) -> str:
     kept = {name: value for name, value in spec.items() if name not in but}
     if "pca" in spec:
         kept["dim"] = spec["pca"]["of"]
-    text = json.dumps(kept, sort_keys=True)
-    return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
+    return joint_digest(json.dumps(kept, sort_keys=True))
 
 
 def slots_digest(slots: Iterable[Mapping[str, Any]]) -> str:
     """The digest of the documents of a group's slots."""
     plain = [{k: v for k, v in slot.items() if k != "variant"} for slot in slots]
-    text = json.dumps(plain, sort_keys=True)
-    return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
+    return joint_digest(json.dumps(plain, sort_keys=True))
 
 
 def stored_name(spec: Mapping[str, Any]) -> str:
@@ -103,8 +101,7 @@ def write_proofs(store: Path, spec: Mapping[str, Any], types: Mapping[str, Proof
 
 def find_proof(folder: Path, spec: Mapping[str, Any]) -> Proof | None:
     """The verdict in a folder of stores on how all groups of slots of a spec are stored."""
-    named = groupby(spec["slots"], lambda slot: (slot["layer"], slot["norm"], slot["pooling"]))
-    groups = {slots_digest(slots) for _, slots in named}
+    groups = {*map(slots_digest, slot_groups(spec["slots"]))}
     features, name = features_digest(spec), stored_name(spec)
     for path in sorted(folder.glob(f"*.zarr{SUFFIX}")):
         proofs = _read(path)

@@ -146,7 +146,8 @@ def test_stores_of_one_basis_are_merged(projected, changed, monkeypatch, tmp_pat
     for other in (whole.path, tmp_path / "nowhere.zarr"):
         with pytest.raises(ConfigError, match=r"extract\.dtype\.basis: .* found none"):
             run(on(other))
-    run(on(first))
+    _, lines = run(on(first))
+    assert f"why: the basis of {first} is taken" in lines
     merge([first, second], tmp_path / "stores" / "merged.zarr")
     merged = FeatureStore.open(tmp_path / "stores" / "merged.zarr")
     assert merged.basis.digest == FeatureStore.open(first).basis.digest
