@@ -118,9 +118,10 @@ def _write_sets(root: Path, episodes: int, seed: int) -> None:
         tqdm(None, "simulating", total, unit="episode", disable=None) as progress,
         ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool,
     ):
+        # The last takes longest: begun first, it does not end alone.
         writing = [
             pool.submit(write, root / name, _simulated(number, episodes, seed, progress, stop))
-            for number, (name, write) in enumerate(_SETS.items())
+            for number, (name, write) in reversed([*enumerate(_SETS.items())])
         ]
         try:
             for written in as_completed(writing):
