@@ -41,13 +41,14 @@ class Basis:
 
 
 def slot_groups(slots: Sequence[Mapping[str, Any]]) -> list[list[Mapping[str, Any]]]:
-    """The slot documents of one variant by layer, norm and pooling, in order."""
-    named = groupby(slots, lambda slot: (slot["layer"], slot["norm"], slot["pooling"]))
+    """The slot documents of the first variant by layer, norm and pooling, in order."""
+    plain = (slot for slot in slots if not slot.get("variant"))
+    named = groupby(plain, lambda slot: (slot["layer"], slot["norm"], slot["pooling"]))
     return [[*group] for _, group in named]
 
 
 def group_sizes(slots: Sequence[Mapping[str, Any]]) -> tuple[int, ...]:
-    """How many slots each group has, of the slot documents of one variant, in order."""
+    """How many slots each group of the first variant has, in order."""
     return tuple(map(len, slot_groups(slots)))
 
 
