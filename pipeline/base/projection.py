@@ -16,6 +16,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.base.errors import ConfigError
+
 _LEAST_SPREAD = 1e-3
 """A share of a channel's size: a smaller spread may be rounding, which is not made larger."""
 _LEAST_VARIANCE = 0.1
@@ -39,13 +41,14 @@ class Basis:
 
 
 def slot_groups(slots: Sequence[Mapping[str, Any]]) -> list[list[Mapping[str, Any]]]:
-    """The slot documents of one variant by layer, norm and pooling, in order."""
-    named = groupby(slots, lambda slot: (slot["layer"], slot["norm"], slot["pooling"]))
+    """The slot documents of the first variant by layer, norm and pooling, in order."""
+    plain = (slot for slot in slots if not slot.get("variant"))
+    named = groupby(plain, lambda slot: (slot["layer"], slot["norm"], slot["pooling"]))
     return [[*group] for _, group in named]
 
 
 def group_sizes(slots: Sequence[Mapping[str, Any]]) -> tuple[int, ...]:
-    """How many slots each group has, of the slot documents of one variant, in order."""
+    """How many slots each group of the first variant has, in order."""
     return tuple(map(len, slot_groups(slots)))
 
 
@@ -54,11 +57,16 @@ def fit_map(values: NDArray[np.floating[Any]], rank: int) -> tuple[NDArray[np.fl
 
     It gives coefficients of mean 0 and, in directions that vary, spread 1, the largest direction
     first. Also returns the share of the standardised variance that the coefficients keep. Equal
-    values give equal bits on one machine.
+    values give equal bits on one machine. Raises `ConfigError` unless there are more rows than
+    `rank`.
     """
+    if len(values) <= rank:
+        raise ConfigError(
+            f"pca {rank}: its directions are fitted to more than {rank} features of each layer, "
+            f"norm and pooling; one of these has {len(values)}. Set a smaller pca, take more "
+            "recordings or ticks, or leave out a view that hardly any of them has."
+        )
     rows = values.astype(np.float64)
-    if not len(rows):
-        return np.zeros((rows.shape[1] + 1, rank), np.float32), 1.0
     mean, size = rows.mean(axis=0), np.sqrt(np.mean(rows**2, axis=0))
     scale = np.maximum(rows.std(axis=0), np.maximum(_LEAST_SPREAD * size, 1e-30))
     standard = (rows - mean) / scale

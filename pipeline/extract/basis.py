@@ -7,7 +7,6 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from pipeline.base.errors import ConfigError
 from pipeline.base.projection import Basis, fit_map
 from pipeline.data.episode import RowFrames
 from pipeline.extract.encoder import Encoder
@@ -57,14 +56,7 @@ def fit_basis(surveyed: Survey, checked: Sequence[CheckedEpisode]) -> tuple[Basi
                 turn = np.arange(min(len(there), _SLOTS_A_ROW)) + number * _SLOTS_A_ROW
                 kept.append(there[turn % max(1, len(there))])
             bar.update()
-    joined = [np.concatenate(kept) for kept in sample]
-    if (fewest := min(map(len, joined))) <= surveyed.spec.dim:
-        raise ConfigError(
-            f"extract.dtype: {surveyed.spec.dim} numbers a slot are fitted to more features than "
-            f"that; a group of slots has {fewest} of them in {count} rows. Set a smaller pca, "
-            "extract more recordings first, or leave out a view that hardly any of them has."
-        )
-    fitted = [fit_map(features, surveyed.spec.dim) for features in joined]
+    fitted = [fit_map(np.concatenate(kept), surveyed.spec.dim) for kept in sample]
     least = min(share for _, share in fitted)
     return Basis(np.stack([affine for affine, _ in fitted])), (
         f"basis of {surveyed.spec.dim} of {whole.dim} numbers a slot, fitted on {count} rows: "

@@ -32,7 +32,7 @@ from pipeline.look.page.blocks import (
 from pipeline.store import FEATURES, KEY_BYTES, Episode, FeatureStore, check_trailers
 from pipeline.store.documents import extract_command
 from pipeline.store.gather import WIDE
-from pipeline.store.proofs import proof_of, stored_name
+from pipeline.store.proofs import storage_note
 from pipeline.vlm.slots import slot_name
 
 NOTHING = "Nothing looks wrong: every check passed."
@@ -124,7 +124,7 @@ def store_report(view: StoreView) -> Report:
     rate = "as recorded" if store.action_hz is None else f"at {store.action_hz:g} Hz"
     reuse = store.vlm_reuse_count
     often = "each of them" if reuse == 1 else f"one in {reuse}"
-    total, proof = len(store.array("vl/time")), proof_of(store.attrs)
+    total, note = len(store.array("vl/time")), storage_note(store.attrs)
     return Report(
         title=f"Store: {store.path.name}",
         verdict=(
@@ -151,7 +151,7 @@ def store_report(view: StoreView) -> Report:
             Section(
                 "What it was made of",
                 [
-                    *([Text(f"Stored in {stored_name(store.spec)}: {proof}.")] if proof else []),
+                    *([Text(f"Its {note}.")] if note else []),
                     Outline("Feature spec", store.spec),
                     Outline(
                         "Computed with", {"environments of VL rows": store.attrs["environment"]}

@@ -30,6 +30,7 @@ from pipeline.base.config import ExportParams
 from pipeline.base.errors import ConfigError, NumericsError
 from pipeline.base.files import OutputKind, replace_folder, sha256_of, write_document
 from pipeline.base.observation import Observation
+from pipeline.base.projection import group_sizes
 from pipeline.policy.checkpoint import PolicyCheckpoint
 from pipeline.policy.expert import Chunk
 from pipeline.policy.observation import AGES, VALIDITY
@@ -171,7 +172,11 @@ def describe(checkpoint: PolicyCheckpoint, folder: str, given: Inputs) -> dict[s
         "units": action["units"],
         "kind": action["kind"],
     }
-    basis = f"{BASIS}: x @ maps[group, :-1] + maps[group, -1] of the model's x, a group a pooling"
+    channels = "the model's channels"
+    if checkpoint.basis is not None:
+        sizes = group_sizes(checkpoint.source["feature_spec"]["slots"])
+        groups = f"groups of {', '.join(map(str, sizes))} slots, in order"
+        channels = f"{BASIS}: x @ maps[group, :-1] + maps[group, -1] of the model's x; {groups}"
     return {
         "checkpoint": folder,
         "step": checkpoint.step,
@@ -180,7 +185,7 @@ def describe(checkpoint: PolicyCheckpoint, folder: str, given: Inputs) -> dict[s
         "feature_spec_digest": checkpoint.source["feature_spec"]["digest"],
         "action_hz": checkpoint.source["action_hz"],
         "horizon": checkpoint.params.horizon,
-        "features_on": "the model's channels" if checkpoint.basis is None else basis,
+        "features_on": channels,
         "inputs": [_input(checkpoint, name, value) for name, value in given.items()],
         "outputs": [outputs],
         "anchored": checkpoint.shape.anchored(action["names"]),

@@ -120,6 +120,14 @@ def proof_of(attributes: Mapping[str, Any]) -> Proof | None:
     return None
 
 
+def storage_note(attributes: Mapping[str, Any]) -> str | None:
+    """How a store keeps its features and what that loses, or how to find out; None for float32."""
+    if (stored := stored_name(attributes["feature_spec"])) == "float32":
+        return None
+    command = "stages.probe with probe.codecs on a store in float32 says what that loses"
+    return f"features are stored in {stored}; {proof_of(attributes) or command}"
+
+
 def _read(path: Path) -> Proofs | None:
     with suppress(CheckpointIncomplete):
         return read_document(path, Proofs)[0]

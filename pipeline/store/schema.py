@@ -381,5 +381,5 @@ def _basis_shape(spec: Spec) -> tuple[int, ...] | Literal[False]:
     """The shape of the basis of this spec's features; False without one."""
     if spec.pca is None:
         return False
-    plain = [slot.model_dump() for slot in spec.slots if not slot.variant]
-    return len(group_sizes(plain)), spec.pca.of + 1, spec.dim or 0
+    groups = group_sizes([slot.model_dump() for slot in spec.slots])
+    return len(groups), spec.pca.of + 1, spec.dim or 0

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import torch
 
-from pipeline.base.config import FinetuneParams, Params, TrainHeadParams, setting
+from pipeline.base.config import PCA, FinetuneParams, Params, TrainHeadParams, setting
 from pipeline.base.digests import file_digest
 from pipeline.base.errors import ConfigError
 from pipeline.base.files import read_document, write_with_digest
@@ -207,6 +207,14 @@ def next_steps(finetune: FinetuneParams, store: FeatureStore) -> list[str]:
     model = [setting("vlm.adapter", learned)]
     if finetune.tuning.method == "full":
         model = [setting("vlm.checkpoint", learned), "--set vlm.adapter=null"]
+    dtype, basis = dtype_of(store.spec), list[str]()
+    if isinstance(dtype, PCA):
+        kept = dtype.model_copy(update={"basis": store.path}).model_dump(mode="json")
+        model.append(setting("extract.dtype", kept))
+        basis = [
+            f"the model was tuned on the basis of {store.path}, so its store takes it; with basis: "
+            "null one is fitted to the tuned features, which the tuned policy does not read"
+        ]
     head, logs = Path("models", tuned.stem), Path("reports", f"{tuned.stem}_training")
     report = Path("reports", tuned.stem)
     places: dict[str, dict[str, Path]] = {
@@ -218,4 +226,4 @@ def next_steps(finetune: FinetuneParams, store: FeatureStore) -> list[str]:
     for stage, keys in places.items():
         settings = [setting(f"{stage}.{key}", place) for key, place in keys.items()]
         lines.append(f"  {command(stage, *(model if stage == 'extract' else ()), *settings)}")
-    return lines
+    return lines + basis

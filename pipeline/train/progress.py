@@ -15,7 +15,7 @@ from pipeline.base.config import TrainHeadParams
 from pipeline.base.text import duration, size
 from pipeline.policy.observation import PolicyShape
 from pipeline.store import FeatureStore
-from pipeline.store.proofs import proof_of, stored_name
+from pipeline.store.proofs import storage_note
 from pipeline.train.batches import Prefetch
 from pipeline.train.sampling import ticks_by_source
 from pipeline.train.split import Split
@@ -131,10 +131,8 @@ def describe_data(
             f"features are on {dim} main directions of {store.spec['pca']['of']} numbers; the "
             f"checkpoint carries their basis, {size(store.basis.maps.nbytes)}"
         )
-    if (dtype := stored_name(store.spec)) not in ("float32", "bfloat16", "float16"):
-        proof = proof_of(store.attrs)
-        command = "stages.probe with probe.codecs on a store in float32 says what that loses"
-        lines.append(f"features are stored in {dtype}; {proof or command}")
+    if note := storage_note(store.attrs):
+        lines.append(note)
     if anchored := shape.anchored(store.streams["action"]["names"]):
         lines.append(f"anchored at the newest frame: {', '.join(anchored)}")
     if not len(split.test):

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from pipeline.base.errors import ConfigError
 from pipeline.base.projection import Basis, apply_map, fit_map, group_sizes
 
 
@@ -41,7 +42,13 @@ def test_what_does_not_vary_is_not_made_to(values: np.ndarray) -> None:
     moved[:, 2:4] += 4
     assert np.isfinite(affine).all()
     assert np.abs(apply_map(moved, affine) - apply_map(still, affine)).max() < 8
-    assert not fit_map(still[:0], 8)[0].any()
+
+
+def test_too_few_rows_are_refused(values: np.ndarray) -> None:
+    assert fit_map(values[:5], 4)[0].shape == (17, 4)
+    for few in (0, 4):
+        with pytest.raises(ConfigError, match=rf"one of these has {few}\. Set a smaller pca"):
+            fit_map(values[:few], 4)
 
 
 def test_a_basis_is_known_by_its_numbers(values: np.ndarray) -> None:

@@ -79,7 +79,7 @@ def test_the_same_recordings_give_the_same_basis_to_the_bit(projected, monkeypat
     two, _ = fit_basis(surveyed, checked)
     assert one.maps.tobytes() == two.maps.tobytes()
     monkeypatch.setattr("pipeline.extract.basis.SAMPLE_ROWS", 6)
-    with pytest.raises(ConfigError, match=r"has 6 of them in 6 rows\. Set a smaller pca"):
+    with pytest.raises(ConfigError, match=r"one of these has 6\. Set a smaller pca"):
         fit_basis(surveyed, checked)
 
 

@@ -295,10 +295,15 @@ def test_golden_rows_are_judged_too(tmp_path) -> None:
         for _ in range(4)
     ]
     object.__setattr__(checkpoint, "golden", tuple(rows))
-    object.__setattr__(checkpoint, "basis", Basis(np.ones((1, 9, 8), np.float32)))
-    (file,) = exported(tmp_path / "head", checkpoint, "torch")["files"].values()
+    object.__setattr__(checkpoint, "basis", Basis(np.ones((2, 9, 8), np.float32)))
+    mean = {"layer": 3, "norm": True, "pooling": "mean"}
+    views = [mean | {"pooling": "view_mean", "view": view} for view in STREAMS["views"]]
+    checkpoint.source["feature_spec"]["slots"] = [mean, *views]
+    receipt = exported(tmp_path / "head", checkpoint, "torch")
+    assert receipt["features_on"].endswith("groups of 1, 2 slots, in order")
+    (file,) = receipt["files"].values()
     assert list(file["deviation"]) == ["random", "golden"]
-    assert np.load(tmp_path / "head" / "basis.npy").shape == (1, 9, 8)
+    assert np.load(tmp_path / "head" / "basis.npy").shape == (2, 9, 8)
     rows[0].features[0, 0] = np.nan
     with pytest.raises(NumericsError, match="found nan over golden inputs"):
         exported(tmp_path / "head", checkpoint, "torch")

@@ -39,6 +39,9 @@ def test_a_verdict_is_found_by_the_features_and_their_type(tmp_path: Path) -> No
     assert find_proof(tmp_path, INT8) == find_proof(tmp_path, FEW) == PROOF
     assert find_proof(tmp_path, FEW | {"dim": 16}) is None
     assert find_proof(tmp_path, INT8 | {"weights": "others"}) is None
+    # A store of augmented variants repeats its slots.
+    twice = [slot | {"variant": variant} for variant in range(2) for slot in slots("mean")]
+    assert find_proof(tmp_path, INT8 | {"slots": twice}) is not None
     # Of many probed groups, the store may keep some, but no other.
     chosen = find_proof(tmp_path, INT8 | {"slots": slots("mean")})
     assert chosen is not None

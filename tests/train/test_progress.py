@@ -89,17 +89,19 @@ def test_a_lossy_store_is_named_with_the_proof(store, params, monkeypatch):
     named = {episode_name(episode): episode_name(episode) for episode in store.episodes}
     split = Split(train, train[:0], train[:0], named, None)
     assert not any("stored in" in line for line in describe_data(store, shape, params(), split))
-    lossy = store.spec | {"storage_dtype": "int8"}
-    monkeypatch.setattr(type(store), "spec", property(lambda own: lossy))
-    lines = describe_data(store, shape, params(), split)
-    assert any("stored in int8; stages.probe with probe.codecs" in line for line in lines)
     loss = {"of": "mean", "slots": "x", "r2": -0.01, "low": -0.02, "high": 0.005}
     loss["error_std"] = 0.1
     proof = {"store": "whole.zarr", "recordings": 24, "ticks": 90, "losses": [loss]}
-    monkeypatch.setattr(store, "attrs", {**store.attrs, "proof": proof})
-    lines = describe_data(store, shape, params(), split)
-    said = "stored in int8; a probe of 24 recordings of whole.zarr found -0.0100 (-0.0200 to"
-    assert any(said in line for line in lines)
+    plain, spec = store.attrs, store.spec
+    for dtype, more, said in (
+        ("int8", {}, "stages.probe with probe.codecs on a store in float32"),
+        ("float16", {}, "stages.probe with probe.codecs on a store in float32"),
+        ("float16", {"proof": proof}, "a probe of 24 recordings of whole.zarr found -0.0100 (-0."),
+    ):
+        lossy = {"feature_spec": spec | {"storage_dtype": dtype}}
+        monkeypatch.setattr(store, "attrs", {**plain, **lossy, **more})
+        lines = describe_data(store, shape, params(), split)
+        assert any(f"features are stored in {dtype}; {said}" in line for line in lines)
 
 
 @pytest.fixture

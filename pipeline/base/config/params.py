@@ -3,7 +3,7 @@
 import inspect
 import json
 import shlex
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from copy import deepcopy
 from itertools import islice
 from pathlib import Path
@@ -135,9 +135,9 @@ def load_section(path: Path, section: type[_Section]) -> _Section:
     return _as_section(_read(path), section, str(path))
 
 
-def setting(key: str, value: Path | Sequence[str]) -> str:
+def setting(key: str, value: Path | Sequence[str] | Mapping[str, Any]) -> str:
     """`--set key=value` for advice; quoted for a shell, so that it gives this value."""
-    texts = [str(value)] if isinstance(value, Path) else list(value)
+    texts = [str(value)] if isinstance(value, Path) else value
     text = yaml.safe_dump(
         texts, default_flow_style=True, allow_unicode=True, width=float("inf")
     ).strip()

@@ -1,16 +1,18 @@
 """The one training loop with a model that learns in front."""
 
 import json
+import shlex
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
+import yaml
 from safetensors.torch import load_file
 from torch import nn
 
-from pipeline.base.config import Params
+from pipeline.base.config import Params, load_params
 from pipeline.base.digests import file_digest
 from pipeline.base.errors import CheckpointMismatch, ConfigError
 from pipeline.base.provenance import read_tuned_on, tuned_on_of_store
@@ -20,7 +22,12 @@ from pipeline.policy.encoders import FeaturePooler
 from pipeline.policy.live_policy import LivePolicy
 from pipeline.store import FeatureStore
 from pipeline.train.batches import BatchIndices, Windows
-from pipeline.train.finetuning import ModelFeatureSource, head_params, out_of_memory_named
+from pipeline.train.finetuning import (
+    ModelFeatureSource,
+    head_params,
+    next_steps,
+    out_of_memory_named,
+)
 from pipeline.train.loop import Trainer
 from pipeline.train.predictions import predict
 from pipeline.train.run import open_run
@@ -221,6 +228,26 @@ def test_full_tuning_saves_a_checkpoint_to_extract_with(params, tmp_path):
     document["extract"]["store"] = str(tmp_path / "full.zarr")
     extract(Params.model_validate(document), say=lambda _: None)
     check_store(load_policy(best), FeatureStore.open(tmp_path / "full.zarr"))
+
+
+def test_the_tuned_features_of_a_projected_store_keep_its_basis(params, tmp_path):
+    """The tuned policy, whose model learned on that basis, fits the store of the command."""
+    projected = {"store": str(tmp_path / "few.zarr"), "dtype": {"pca": 12, "then": "float16"}}
+    given = params(extract=projected, finetune={"max_steps": 1})
+    extract(given, say=lambda _: None)
+    made = trainer(given)
+    made.fit()
+    said = next_steps(given.finetune, made.store)
+    assert said[-1].startswith(f"the model was tuned on the basis of {made.store.path}, ")
+    file = tmp_path / "params.yaml"
+    file.write_text(yaml.safe_dump(given.model_dump(mode="json")))
+    printed = next(line for line in said if "stages.extract" in line)
+    overrides = [option for option in shlex.split(printed) if "=" in option]
+    extract(load_params(file, overrides), say=lambda _: None)
+    check_store(
+        load_policy(find_policy(given.finetune.output)),
+        FeatureStore.open(tmp_path / "few_tuned.zarr"),
+    )
 
 
 def test_a_gpu_that_is_too_small_ends_in_what_takes_less():
