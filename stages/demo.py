@@ -1,6 +1,6 @@
 """Write the demo: simulated needle insertions in every format, and a small Qwen2.5-VL.
 
-Writes demo.episodes episodes in each of four formats to demo.recordings, about 60 MB, and a model
+Writes demo.episodes episodes in each of four formats to demo.recordings, about 160 MB, and a model
 with random weights to demo.checkpoint. The same seed gives the same bytes. Finished recordings are
 kept, an interrupted run leaves none, and a folder that the demo did not write is refused.
 
