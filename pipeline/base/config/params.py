@@ -137,9 +137,9 @@ def load_section(path: Path, section: type[_Section]) -> _Section:
 
 def setting(key: str, value: Path | Sequence[str] | Mapping[str, Any]) -> str:
     """`--set key=value` for advice; quoted for a shell, so that it gives this value."""
-    texts = [str(value)] if isinstance(value, Path) else value
+    plain = [str(value)] if isinstance(value, Path) else value
     text = yaml.safe_dump(
-        texts, default_flow_style=True, allow_unicode=True, width=float("inf")
+        plain, default_flow_style=True, allow_unicode=True, width=float("inf")
     ).strip()
     text = text[1:-1] if isinstance(value, Path) else text
     return f"--set {shlex.quote(f'{key}={text}')}"
