@@ -129,7 +129,7 @@ def export_head(
             say("translating it to ONNX")
             write_onnx(program, few, path := place / "head.onnx", contract)
             files[path.name] = _compare(path, onnx_runner(path), head, given, checkpoint)
-        if checkpoint.basis is not None:
+        if checkpoint.basis is not None and "features" in few:
             np.save(place / BASIS, checkpoint.basis.maps)
         write_document(place / RECEIPT, contract | {"files": files})
 
@@ -173,7 +173,7 @@ def describe(checkpoint: PolicyCheckpoint, folder: str, given: Inputs) -> dict[s
         "kind": action["kind"],
     }
     channels = "the model's channels"
-    if checkpoint.basis is not None:
+    if checkpoint.basis is not None and "features" in given:
         sizes = group_sizes(checkpoint.source["feature_spec"]["slots"])
         groups = f"groups of {', '.join(map(str, sizes))} slots, in order"
         channels = f"{BASIS}: x @ maps[group, :-1] + maps[group, -1] of the model's x; {groups}"

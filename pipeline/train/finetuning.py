@@ -209,12 +209,12 @@ def next_steps(finetune: FinetuneParams, store: FeatureStore) -> list[str]:
         model = [setting("vlm.checkpoint", learned), "--set vlm.adapter=null"]
     dtype, basis = dtype_of(store.spec), list[str]()
     if isinstance(dtype, PCA):
-        kept = dtype.model_copy(update={"basis": store.path}).model_dump(mode="json")
-        model.append(setting("extract.dtype", kept))
+        dtype = dtype.model_copy(update={"basis": store.path}).model_dump(mode="json")
         basis = [
             f"the model was tuned on the basis of {store.path}, so its store takes it; with basis: "
             "null one is fitted to the tuned features, which the tuned policy does not read"
         ]
+    model.append(setting("extract.dtype", dtype))
     head, logs = Path("models", tuned.stem), Path("reports", f"{tuned.stem}_training")
     report = Path("reports", tuned.stem)
     places: dict[str, dict[str, Path]] = {

@@ -304,6 +304,8 @@ def test_golden_rows_are_judged_too(tmp_path) -> None:
     (file,) = receipt["files"].values()
     assert list(file["deviation"]) == ["random", "golden"]
     assert np.load(tmp_path / "head" / "basis.npy").shape == (2, 9, 8)
+    unread = export.describe(checkpoint, "head", {})
+    assert unread["features_on"] == "the model's channels", "without the input, no basis either"
     rows[0].features[0, 0] = np.nan
     with pytest.raises(NumericsError, match="found nan over golden inputs"):
         exported(tmp_path / "head", checkpoint, "torch")

@@ -84,7 +84,7 @@ def test_it_tunes_and_says_how_to_go_on_and_that_works(
     write_params, extracted, tmp_path, capsys, monkeypatch
 ):
     monkeypatch.setattr("pipeline.look.page.writing.write_report", lambda *_: [])
-    params, seed = str(write_params()), "train_head.seed=1"
+    params, seed = str(write_params(extract={"dtype": "int8"})), "train_head.seed=1"
     assert run("", finetune.main, ["--params", params, "--set", seed]) == 0
     captured = capsys.readouterr()
     assert captured.err == "", "no progress where there is no terminal"
@@ -106,6 +106,7 @@ def test_it_tunes_and_says_how_to_go_on_and_that_works(
     assert run("", extract.main, shlex.split(printed.splitlines()[0])) == 0, "as it was printed"
     spec = json.loads((tuned / "zarr.json").read_text())["attributes"]["feature_spec"]
     assert spec["adapter"] is not None and adapter.is_dir()
+    assert spec["storage_dtype"] == "float32", "the type of the store that it was tuned on"
     assert run("", train_head.main, ["--params", params, *training.split()]) == 0
     report = tmp_path / "report"
     judged = [f"evaluate.checkpoint={tmp_path / 'tuned'}", f"evaluate.output={report}"]

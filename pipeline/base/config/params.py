@@ -137,11 +137,12 @@ def load_section(path: Path, section: type[_Section]) -> _Section:
 
 def setting(key: str, value: Path | Sequence[str] | Mapping[str, Any]) -> str:
     """`--set key=value` for advice; quoted for a shell, so that it gives this value."""
-    plain = [str(value)] if isinstance(value, Path) else value
+    alone = isinstance(value, Path | str)
+    plain = [str(value)] if alone else value
     text = yaml.safe_dump(
         plain, default_flow_style=True, allow_unicode=True, width=float("inf")
     ).strip()
-    text = text[1:-1] if isinstance(value, Path) else text
+    text = text[1:-1] if alone else text
     return f"--set {shlex.quote(f'{key}={text}')}"
 
 
