@@ -44,10 +44,12 @@ def moving(observe):
 
 
 def test_the_state_is_interpolated_on_its_clock(moving):
-    change = state_at_frame(moving, KINDS) - moving.state[:, -1]
-    turn = torch.tensor([2 * np.pi, *[torch.inf] * 3, 360.0, 360.0, 360.0])
-    change = torch.where(turn.isinf(), change, (change + turn / 2) % turn - turn / 2)
-    torch.testing.assert_close(change, -moving.feature_age[:, None] * SPEED, atol=2e-4, rtol=0)
+    oldest = replace(moving, feature_age=moving.state_age[:, :2].mean(dim=1))
+    for seen in (moving, oldest):
+        change = state_at_frame(seen, KINDS) - seen.state[:, -1]
+        turn = torch.tensor([2 * np.pi, *[torch.inf] * 3, 360.0, 360.0, 360.0])
+        change = torch.where(turn.isinf(), change, (change + turn / 2) % turn - turn / 2)
+        torch.testing.assert_close(change, -seen.feature_age[:, None] * SPEED, atol=2e-4, rtol=0)
 
 
 def test_a_step_counts_from_the_frame_and_back(moving):
