@@ -18,6 +18,10 @@ from numpy.typing import NDArray
 
 from pipeline.base.errors import ConfigError
 
+SAMPLE_ROWS = 1024
+"""Most rows of the sample that a map is fitted to, evenly spread."""
+SLOTS_A_ROW = 4
+"""Most slots of a group that a row of the sample gives."""
 _LEAST_SPREAD = 1e-3
 """A share of a channel's size: a smaller spread may be rounding, which is not made larger."""
 _LEAST_VARIANCE = 0.1

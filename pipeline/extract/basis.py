@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from pipeline.base.projection import Basis, fit_map
+from pipeline.base.projection import SAMPLE_ROWS, SLOTS_A_ROW, Basis, fit_map
 from pipeline.data.episode import RowFrames
 from pipeline.extract.encoder import Encoder
 from pipeline.extract.rows import ReadyRow, RowPreparation
@@ -15,10 +15,6 @@ from pipeline.extract.survey import CheckedEpisode, Survey
 from pipeline.store.episodes import episode_arrays
 from pipeline.vlm.qwen import FrozenVLM
 
-SAMPLE_ROWS = 1024
-"""Most rows of the sample."""
-_SLOTS_A_ROW = 4
-"""Most slots of a group that a row of the sample gives, the next ones of the next row."""
 _BATCH = 8
 """Not the fastest size: with another one every time, the basis would not have the same bits."""
 
@@ -53,7 +49,8 @@ def fit_basis(surveyed: Survey, checked: Sequence[CheckedEpisode]) -> tuple[Basi
             groups = np.split(values, np.cumsum(whole.groups)[:-1])
             for kept, group in zip(sample, groups, strict=True):
                 there = group[group.any(axis=1)]  # zeros are of missing views
-                turn = np.arange(min(len(there), _SLOTS_A_ROW)) + number * _SLOTS_A_ROW
+                # Each row gives the slots that follow those of the row before.
+                turn = np.arange(min(len(there), SLOTS_A_ROW)) + number * SLOTS_A_ROW
                 kept.append(there[turn % max(1, len(there))])
             bar.update()
     fitted = [fit_map(np.concatenate(kept), surveyed.spec.dim) for kept in sample]

@@ -16,7 +16,7 @@ from pipeline.base.arrays import widen
 from pipeline.base.config import PCA, FeatureDtype, ProbeParams, stored_as
 from pipeline.base.errors import ConfigError, NumericsError, StoreMismatch
 from pipeline.base.packing import pack, unpack
-from pipeline.base.projection import apply_map, fit_map
+from pipeline.base.projection import SAMPLE_ROWS, SLOTS_A_ROW, apply_map, fit_map
 from pipeline.evaluate.figures import Figure
 from pipeline.evaluate.probe.inputs import (
     Inputs,
@@ -37,8 +37,6 @@ _MOST_SINGLE = 300
 """Most slots that are scored one by one."""
 _ROUNDING_SHARE = 1e-5
 """A spread below this share of a channel's size is rounding: the channel does not vary."""
-_SAMPLE = 4096
-"""Most features to which a projection is fitted, as in an extraction."""
 _ROUNDING = 1e-9
 """A gain below this counts as none."""
 
@@ -251,10 +249,10 @@ class _Projection:
     def __init__(
         self, store: FeatureStore, rows: NDArray[np.int64], slots: Sequence[int], rank: int
     ) -> None:
-        """Fitted on some of the valid slots of these VL rows, evenly spread."""
+        """Fitted on as many valid slots of these VL rows as an extraction takes, evenly spread."""
         valid = store.array("vl/slot_valid")[rows][:, list(slots)] != 0
         row, slot = np.nonzero(valid)
-        chosen = evenly(np.arange(len(row)), _SAMPLE)
+        chosen = evenly(np.arange(len(row)), SAMPLE_ROWS * min(len(slots), SLOTS_A_ROW))
         values = widen(store.array(FEATURES)[rows[row[chosen]], np.array(slots)[slot[chosen]]])
         self.affine, _ = fit_map(values, rank)
         self._mean, self._spread = values.mean(axis=0), values.std(axis=0, dtype=np.float64)

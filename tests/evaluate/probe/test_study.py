@@ -92,11 +92,16 @@ def test_a_codec_is_judged_by_its_error_and_by_what_it_costs(
     assert metrics(timed)["pass_s"] == {"0": 0.0123}
 
 
-def test_directions_of_too_few_rows_are_refused(tiny_store: Make, tmp_path: Path) -> None:
+def test_directions_of_too_few_rows_are_refused(
+    tiny_store: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     store = FeatureStore.open(tiny_store(tmp_path, slots=1))
     assert probed(store, max_ticks=8).groups
     with pytest.raises(ConfigError, match=r"pca 8: .* has 8\. Set a smaller pca"):
         probed(store, codecs=({"pca": 8},), max_ticks=8)
+    monkeypatch.setattr("pipeline.evaluate.probe.study.SAMPLE_ROWS", 7)  # as in an extraction
+    with pytest.raises(ConfigError, match=r"pca 8: .* has 7\. Set a smaller pca"):
+        probed(store, codecs=({"pca": 8},))
 
 
 @pytest.fixture
