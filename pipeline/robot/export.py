@@ -30,7 +30,7 @@ from pipeline.base.config import ExportParams
 from pipeline.base.errors import ConfigError, NumericsError
 from pipeline.base.files import OutputKind, replace_folder, sha256_of, write_document
 from pipeline.base.observation import Observation
-from pipeline.base.projection import group_sizes
+from pipeline.base.projection import Basis, group_sizes
 from pipeline.policy.checkpoint import PolicyCheckpoint
 from pipeline.policy.expert import Chunk
 from pipeline.policy.observation import AGES, VALIDITY
@@ -129,8 +129,8 @@ def export_head(
             say("translating it to ONNX")
             write_onnx(program, few, path := place / "head.onnx", contract)
             files[path.name] = _compare(path, onnx_runner(path), head, given, checkpoint)
-        if checkpoint.basis is not None and "features" in few:
-            np.save(place / BASIS, checkpoint.basis.maps)
+        if (basis := _basis(checkpoint, few)) is not None:
+            np.save(place / BASIS, basis.maps)
         write_document(place / RECEIPT, contract | {"files": files})
 
     replace_folder(params.output, write, EXPORT)
@@ -173,7 +173,7 @@ def describe(checkpoint: PolicyCheckpoint, folder: str, given: Inputs) -> dict[s
         "kind": action["kind"],
     }
     channels = "the model's channels"
-    if checkpoint.basis is not None and "features" in given:
+    if _basis(checkpoint, given) is not None:
         sizes = group_sizes(checkpoint.source["feature_spec"]["slots"])
         groups = f"groups of {', '.join(map(str, sizes))} slots, in order"
         channels = f"{BASIS}: x @ maps[group, :-1] + maps[group, -1] of the model's x; {groups}"
@@ -192,6 +192,11 @@ def describe(checkpoint: PolicyCheckpoint, folder: str, given: Inputs) -> dict[s
         "relative": checkpoint.shape.relative_to_state(action["names"]),
         "guides": "not exported: real-time chunking (rtc) differentiates the head",
     }
+
+
+def _basis(checkpoint: PolicyCheckpoint, given: Inputs) -> Basis | None:
+    """The basis that the features among the inputs are on; None without one, or without them."""
+    return checkpoint.basis if "features" in given else None
 
 
 def write_onnx(
