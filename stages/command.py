@@ -136,7 +136,7 @@ def _run(
             print("\n".join(described_keys(sections or tuple(Params.model_fields))))
         else:
             given = [pair for shorthand in shorthands for pair in shorthand.override(options)]
-            alone = any(one.alone and one.override(options) for one in shorthands)
+            alone = any(shorthand.alone and shorthand.override(options) for shorthand in shorthands)
             absent = alone and options.params == DEFAULT_PARAMS and not DEFAULT_PARAMS.exists()
             if absent:
                 print(f"no {DEFAULT_PARAMS} in this folder: every key has its default")

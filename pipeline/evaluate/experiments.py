@@ -126,7 +126,7 @@ def read_experiments(reports: Path) -> tuple[Experiment, ...]:
     of_recipe: dict[str, list[Experiment]] = {}
     for experiment in experiments:
         of_recipe.setdefault(experiment.judged.policy.recipe, []).append(experiment)
-    return tuple(sorted(map(_merged, of_recipe.values()), key=lambda one: one.name))
+    return tuple(sorted(map(_merged, of_recipe.values()), key=lambda experiment: experiment.name))
 
 
 def best_experiment(experiments: Sequence[Experiment], span: str) -> Experiment:

@@ -144,8 +144,9 @@ def survey(params: Params, digests: ContentDigests) -> Survey:
     if not episodes:
         _refuse_bad(bad, total=len(bad))
     spec, plan = _spec_and_plan(data, vlm, extract, episodes, digests)
-    found = tuple(episodes), opened.missing, tuple(bad)
-    return Survey(data, vlm, extract, *found, spec, rotation, plan)
+    return Survey(
+        data, vlm, extract, tuple(episodes), opened.missing, tuple(bad), spec, rotation, plan
+    )
 
 
 def _spec_and_plan(

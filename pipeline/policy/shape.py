@@ -132,15 +132,16 @@ def find_anchors(
     rotation vector `rx`, `ry`, `rz`, which is anchored as a whole, by the angles of the arm's pose.
     Raises `ConfigError` naming a channel that is no such delta.
     """
-    told = told_deltas(action, state)
+    measured = told_deltas(action, state)
     whole = {*_ROTVEC} <= {*wanted} & {*action["names"]} and {*_POSE_ANGLES} <= {*state["names"]}
     composed = _ROTVEC if whole and action["kind"] == "delta" else ()
-    if unknown := [name for name in wanted if name not in {*told, *composed}]:
+    if unknown := [name for name in wanted if name not in {*measured, *composed}]:
         raise ConfigError(
             "train_head.anchor: expected deltas whose motion the state tells "
-            f"({', '.join(told) or 'the training episodes have none'}), found {', '.join(unknown)}"
+            f"({', '.join(measured) or 'the training episodes have none'}), "
+            f"found {', '.join(unknown)}"
         )
-    anchors = [Anchor((action["names"].index(n),), (told[n],)) for n in wanted if n in told]
+    anchors = [Anchor((action["names"].index(n),), (measured[n],)) for n in wanted if n in measured]
     if composed:
         places = [(action, _ROTVEC), (state, _POSE_ANGLES)]
         anchors.append(Anchor(*(tuple(map(s["names"].index, n)) for s, n in places), composed=True))
@@ -156,10 +157,10 @@ def find_relative(action: Mapping[str, Any], state: Mapping[str, Any]) -> tuple[
     kinds = channel_kinds(state["names"], state["units"])
     absolute = action["kind"] == "absolute"
     channels = zip(action["names"], action["units"], strict=True) if absolute else ()
-    told = [_told(name, unit, state) for name, unit in channels]
+    by_state = [_told(name, unit, state) for name, unit in channels]
     pairs = [
         Anchor((place,), (measured,))
-        for place, measured in enumerate(told)
+        for place, measured in enumerate(by_state)
         if measured is not None and kinds[measured] != "rotation"
     ]
     if not pairs:

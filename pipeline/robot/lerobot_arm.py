@@ -130,9 +130,11 @@ def _matched(
     return keys
 
 
-def _refuse(expected: str, found: str, policy: Sequence[str], robot: Mapping[str, Any]) -> NoReturn:
+def _refuse(
+    expected: str, actual: str, policy: Sequence[str], robot: Mapping[str, Any]
+) -> NoReturn:
     raise CheckpointMismatch(
-        f"LeRobotArm: the policy needs {expected}, found {found}. The policy has "
+        f"LeRobotArm: the policy needs {expected}, found {actual}. The policy has "
         f"{', '.join(policy)}; the robot has {', '.join(robot)}. Name what belongs together in "
         "`cameras` (view: camera) and `motors` (channel: motor)"
     )

@@ -113,9 +113,9 @@ def _array(description: Mapping[Any, Any]) -> NDArray[Any]:
     if not sizes or len(shape) > MAX_RANK:
         raise WireError(f"expected the shape of an array, found {shape!r:.80}")
     size = math.prod(shape) * dtype.itemsize
-    found = len(data) if isinstance(data, bytes) else type(data).__name__
-    if found != size:
-        raise WireError(f"expected {size} bytes for an array of {dtype}, found {found}")
+    length = len(data) if isinstance(data, bytes) else type(data).__name__
+    if length != size:
+        raise WireError(f"expected {size} bytes for an array of {dtype}, found {length}")
     plain = np.ndarray(shape, dtype, buffer=data)
     return plain.astype(dtype.newbyteorder("="))
 

@@ -180,8 +180,8 @@ def check_chunks(root: Path, specs: Iterable[ArraySpec], seal: Seal | None) -> N
 
 def find_damage(root: Path, specs: Iterable[ArraySpec], seal: Seal | None = None) -> str | None:
     """The first chunk file that is not as it was written, and what is wrong; else None."""
-    with closing(damages(root, specs, seal)) as found:
-        return next((f"{path}: {what}" for path, what in found), None)
+    with closing(damages(root, specs, seal)) as damaged:
+        return next((f"{path}: {what}" for path, what in damaged), None)
 
 
 def damages(

@@ -229,7 +229,7 @@ def live_differences(trained: Mapping[str, Any], live: Mapping[str, Any]) -> lis
 
 def _as_live(spec: Mapping[str, Any]) -> dict[str, Any]:
     plain = [slot for slot in spec.get("slots", []) if slot.get("variant", 0) == 0]
-    slots = [{name: said for name, said in slot.items() if name != "variant"} for slot in plain]
+    slots = [{name: value for name, value in slot.items() if name != "variant"} for slot in plain]
     other = {"digest", "storage_dtype", "variants", "augmentation"}
     return {name: value for name, value in spec.items() if name not in other} | {"slots": slots}
 

@@ -109,8 +109,8 @@ def load_checkpoint(vlm: VLMParams, device: torch.device, dtype: str | None = No
     model, report = loaded
     missing, unexpected = set(report["missing_keys"]) - _UNUSED, set(report["unexpected_keys"])
     _refuse_strange(folder, missing, unexpected, f"{files[-1].name} and config.json")
-    for name, found, wanted in report["mismatched_keys"]:
-        why = f"expected {name} of {list(wanted)} by config.json, found {list(found)}"
+    for name, stored, wanted in report["mismatched_keys"]:
+        why = f"expected {name} of {list(wanted)} by config.json, found {list(stored)}"
         raise VLMS.refusal(folder, why)
     return model
 

@@ -135,7 +135,7 @@ def load_section(path: Path, section: type[_Section]) -> _Section:
     return _as_section(_read(path), section, str(path))
 
 
-def setting(key: str, value: Path | Sequence[str] | Mapping[str, Any]) -> str:
+def setting(key: str, value: Path | str | Sequence[str] | Mapping[str, Any]) -> str:
     """`--set key=value` for advice; quoted for a shell, so that it gives this value."""
     alone = isinstance(value, Path | str)
     plain = [str(value)] if alone else value

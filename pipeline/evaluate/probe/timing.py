@@ -43,7 +43,7 @@ def time_passes(
     views, target = store.spec["views"], resolve_device(device)
     with closing(ContentDigests.to_read(ledger_path(store.path))) as digests:
         spec = feature_spec(vlm, "float32", views, digests.of, digests.text)
-    held, given = ({n: said.get(n) for n in _SAME} for said in (store.spec, spec.document))
+    held, given = ({n: document.get(n) for n in _SAME} for document in (store.spec, spec.document))
     if lines := describe(differences(held, given)):
         raise StoreMismatch(f"vlm is not the model of {store.path}: {lines[0]}")
     row = Preparer(vlm, spec).prepare(store.golden[0].instruction, store.golden[0].frames)
