@@ -65,8 +65,11 @@ class Proofs(Document):
 
 
 def features_digest(spec: Mapping[str, Any]) -> str:
-    """The digest of a feature spec without how the features are stored, and without the slots."""
-    but = {"digest", "storage_dtype", "pca", "slots"}
+    """The digest of a feature spec without how the features are stored, the slots and the variants.
+
+    A probe reads plain frames alone.
+    """
+    but = {"digest", "storage_dtype", "pca", "slots", "variants", "augmentation"}
     kept = {name: value for name, value in spec.items() if name not in but}
     if "pca" in spec:
         kept["dim"] = spec["pca"]["of"]

@@ -41,7 +41,8 @@ def test_a_verdict_is_found_by_the_features_and_their_type(tmp_path: Path) -> No
     assert find_proof(tmp_path, INT8 | {"weights": "others"}) is None
     # A store of augmented variants repeats its slots.
     twice = [slot | {"variant": variant} for variant in range(2) for slot in slots("mean")]
-    assert find_proof(tmp_path, INT8 | {"slots": twice}) is not None
+    varied = INT8 | {"slots": twice, "variants": 2, "augmentation": {"shift": 0.1}}
+    assert find_proof(tmp_path, varied) is not None
     # Of many probed groups, the store may keep some, but no other.
     chosen = find_proof(tmp_path, INT8 | {"slots": slots("mean")})
     assert chosen is not None
