@@ -131,6 +131,7 @@ ROLLOUTS: dict[str, tuple[str, ...]] = {
     **{f"{n} steps": (_NEWEST, f"rollout.execute={n}") for n in (2, 3, 4, 6, 8)},
     **{f"state {late}": () for late in LATE},
     "last weights": ("rollout.checkpoint={folder}/model/last",),
+    "the policy it was tuned with": ("rollout.checkpoint={folder}/../tuned-tokens/best",),
     "spoilt": (f"rollout.ablations={json.dumps(get_args(RolloutAblation))}",),
 }
 
@@ -346,6 +347,7 @@ TABLES = {
     ),
     "model": Table((AS_IT_IS, "tuned model")),
     "tuned tokens": Table(("tokens, pooler", "tuned tokens, pooler")),
+    "live": Table(("tuned tokens, pooler",), (ON_TIME, "the policy it was tuned with")),
     "images": Table((AS_IT_IS, "larger images")),
     "learning": Table((AS_IT_IS, "horizon 16", "not averaged")),
     "longer": Table(("four times as long", "flow matching, four times as long")),
