@@ -10,13 +10,7 @@ import numpy as np
 import pytest
 
 from experiments import closed_loop
-from experiments.recipes import (
-    RECIPES,
-    ROLLOUTS,
-    STORES,
-    TABLES,
-    store_settings,
-)
+from experiments.recipes import RECIPES, ROLLOUTS, STORES, TABLES, store_settings
 from pipeline.base.config import load_params
 
 PARAMS = Path(__file__).parents[1] / "params.yaml"

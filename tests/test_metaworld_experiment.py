@@ -6,7 +6,7 @@ from concurrent.futures import Future
 from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,9 +16,6 @@ from pipeline.base.config import Source
 from pipeline.base.errors import ConfigError
 from pipeline.data import open_recordings
 from pipeline.simulation.meta_world import HZ, VIEW, instruction_of
-
-if TYPE_CHECKING:
-    from experiments.metaworld.protocol import Run
 
 needs_meta_world = pytest.mark.skipif(
     find_spec("metaworld") is None, reason="needs the extra `metaworld`"
@@ -103,7 +100,7 @@ def test_the_protocol_goes_from_demonstrations_to_a_table(tmp_path, monkeypatch,
     assert "features off" in capsys.readouterr().out
 
 
-def run_here(run: "Run", monkeypatch: pytest.MonkeyPatch) -> None:
+def run_here(run: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     """`run_protocol` without processes of its own, which would not see what is replaced here."""
     from experiments.metaworld import protocol
 

@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from pipeline.base.config import LimitsFile, load_params, load_section, setting
+from pipeline.base.differences import differences
 from pipeline.base.errors import ConfigError
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -45,21 +46,8 @@ DEMO_ONLY = {
 
 def test_a_minimal_file_means_what_the_projects_own_says(minimal):
     """So that who begins with three lines gets the model, steps and slots of the documentation."""
-    ours, theirs = (
-        _flat(load_params(path).model_dump()) for path in (ROOT / "params.yaml", minimal)
-    )
-    assert {key for key in ours | theirs if ours.get(key) != theirs.get(key)} == DEMO_ONLY
-
-
-def _flat(section, above=""):
-    """Values by their full keys."""
-    if not isinstance(section, dict):
-        return {above: section}
-    return {
-        key: value
-        for name, inner in section.items()
-        for key, value in _flat(inner, f"{above}.{name}" if above else name).items()
-    }
+    ours, theirs = (load_params(path).model_dump() for path in (ROOT / "params.yaml", minimal))
+    assert differences(ours, theirs).keys() == DEMO_ONLY
 
 
 def test_overrides_are_yaml_and_reach_any_depth(minimal):

@@ -42,7 +42,6 @@ def test_a_damaged_ledger_is_begun_anew(tmp_path):
         ("text", ContentDigests),
         ("folder", ContentDigests.to_read),
         ("another application", ContentDigests),
-        ("another application", ContentDigests.to_read),
     ],
 )
 def test_what_is_no_ledger_is_left_as_it_is(tmp_path, kind, opened):

@@ -35,29 +35,15 @@ def put(folder: Path, text: str) -> None:
 
 @pytest.mark.parametrize("survived", [0, 4, 5, 6])
 def test_a_kill_between_any_two_steps_leaves_the_old_or_the_new(tmp_path, monkeypatch, survived):
-    folder = tmp_path / "last"
+    folder, steps = tmp_path / "last", ((Path, "rename"), (files, "sync"))
     put(folder, "old")
-    steps = 0
-
-    def counted(real):
-        def step(*arguments, **keywords):
-            nonlocal steps
-            if steps == survived:
-                raise Killed
-            steps += 1
-            return real(*arguments, **keywords)
-
-        return step
 
     def gone(path: Path) -> None:
         raise Killed
 
     with monkeypatch.context() as patched:
-        patched.setattr(Path, "rename", counted(Path.rename))
-        patched.setattr("pipeline.base.files.sync", counted(lambda path: None))
         patched.setattr("shutil.rmtree", gone)
-        with pytest.raises(Killed):
-            put(folder, "new")
+        assert killed_before(survived, partial(put, folder, "new"), steps)
     recover_folder(folder, KIND)
     assert (folder / "a").read_text() == ("new" if survived >= 5 else "old")
     assert os.listdir(tmp_path) == ["last"]

@@ -6,7 +6,6 @@ import runpy
 import sys
 import tempfile
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -18,17 +17,6 @@ BENCHMARKS = {
 }
 ALONE = "gather"
 """It forks, which a process with the threads of other tests should not: run it by hand."""
-
-
-def assert_is_a_report(out: str, name: str) -> None:
-    assert out.count("\n") == 1
-    line: dict[str, Any] = json.loads(out)
-    assert line["command"] == f"python -m benchmarks.{name} --quick"
-    assert line["quick"] is True
-    assert line["machine"]["cores"] >= 1
-    assert {"settings", "results", "ratios", "targets"} <= set(line)
-    for target in line["targets"]:
-        assert {"what", "found", "wanted", "reached"} <= set(target)
 
 
 SLOW = {"extract", "head_latency", "reading", "robot_jitter", "slots"}
@@ -50,5 +38,13 @@ def test_a_quick_run_prints_one_line_of_json(name, tmp_path, monkeypatch, capfd)
     # runpy warns of a module that another test has imported.
     monkeypatch.delitem(sys.modules, f"benchmarks.{name}", raising=False)
     runpy.run_module(f"benchmarks.{name}", run_name="__main__", alter_sys=True)
-    assert_is_a_report(capfd.readouterr().out, name)
+    out = capfd.readouterr().out
+    assert out.count("\n") == 1
+    line = json.loads(out)
+    assert line["command"] == f"python -m benchmarks.{name} --quick"
+    assert line["quick"] is True
+    assert line["machine"]["cores"] >= 1
+    assert {"settings", "results", "ratios", "targets"} <= set(line)
+    for target in line["targets"]:
+        assert {"what", "found", "wanted", "reached"} <= set(target)
     assert not list(tmp_path.iterdir()), "it cleans up"

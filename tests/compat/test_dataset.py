@@ -10,7 +10,7 @@ import pytest
 import torch
 from torch.utils.data import DataLoader
 
-from pipeline.base.config import Source, TrainHeadParams
+from pipeline.base.config import Source
 from pipeline.base.errors import ConfigError, RecordingError, StoreIncomplete, StoreMismatch
 from pipeline.base.observation import Observation
 from pipeline.datasets import (
@@ -23,13 +23,6 @@ from pipeline.datasets import (
 )
 from pipeline.store import Batch, FeatureStore
 
-SMALL = TrainHeadParams.model_validate(
-    {
-        "sensor_encoder": {"channels": [16, 16], "layers": 1, "heads": 2, "output_dim": 16},
-        "state_encoder": {"dim": 16, "layers": 1, "heads": 2, "output_dim": 16},
-        "expert": {"dim": 16, "layers": 1, "heads": 2},
-    }
-)
 STREAMS = (
     "feature_age",
     "sensor",
@@ -83,7 +76,6 @@ class TestItems:
         assert a.features.shape == (len(items), 0, 0) and a.key is None and a.images is not None
         assert b.features.shape[1:] == cached.store.feature_shape and b.images is None
         rows = b.vl_row.numpy()
-        assert b.key is not None
         assert np.array_equal(b.key.numpy(), cached.store.array("vl/key")[rows])
 
     def test_samples_make_the_batch_that_is_read_in_one_go(self, live, cached):
@@ -101,7 +93,6 @@ class TestItems:
 
     def test_a_row_is_decoded_once_for_the_ticks_that_share_it(self, live):
         batch = live.__getitems__([0, 1, 2, 3])
-        assert batch.images is not None
         assert batch.vl_row.tolist() == [0, 0, 0, 1]
         assert batch.images[0] is batch.images[2]
         assert batch.images[0] is not batch.images[3]
@@ -156,7 +147,6 @@ class TestStore:
         assert {episode.format for episode in old.episodes} == {"old"}
         assert {episode.format for episode in new.episodes} == {"new"}
         assert len(old) + len(new) == extracted.ticks
-        assert isinstance(new, UnifiedVLADataset)
         assert async_collate_fn_with_sensor is unified_collate_fn
         again = NewAsyncInsertionDataset(recordings / "new", store=extracted)
         assert np.array_equal(again.ticks, new.ticks)
@@ -170,9 +160,8 @@ class TestStore:
             UnifiedVLADataset(folder, store=extracted)
 
     def test_settings_of_other_ticks_are_refused(self, extracted: FeatureStore) -> None:
-        other: dict[str, Any] = {"vlm_reuse_count": 5, "action_rotation": "euler_delta"}
         with pytest.raises(StoreMismatch, match=r"vlm_reuse_count: 5 .*found 3.*euler.*rotvec"):
-            UnifiedVLADataset(store=extracted, **other)
+            UnifiedVLADataset(store=extracted, vlm_reuse_count=5, action_rotation="euler_delta")
         with pytest.raises(StoreMismatch, match="'lerobot', found new, old"):
             UnifiedVLADataset(store=extracted, format="lerobot")
 

@@ -97,5 +97,3 @@ class TestLoader:
     def test_one_side_alone_is_a_mixture_of_one(self, recordings: Path) -> None:
         loader = create_unified_dataloader(new_dataset_path=recordings / "new", batch_size=4)
         assert len(next(iter(loader))) == 4
-        with pytest.raises(ConfigError, match="recordings or a store"):
-            create_unified_dataloader()

@@ -72,22 +72,19 @@ def write_csv(path: Path, header: Sequence[str], rows: Sequence[Sequence[object]
     return path
 
 
-def write_raw(
-    folder: Path, truth: Truth, views: Sequence[str] = ("View1", "View5"), sensor: bool = True
-) -> Path:
+def write_raw(folder: Path, truth: Truth, views: Sequence[str] = ("View1", "View5")) -> Path:
     table = zip(truth.state_time, truth.state, strict=True)
     write_csv(
         folder / "robot_state_x.csv",
         ["recv_timestamp", "origin_timestamp", "force_placeholder", *STATE_NAMES],
         [[repr(float(t) + 9), repr(float(t)), 0.0, *map(float, row)] for t, row in table],
     )
-    if sensor:
-        np.savez(
-            folder / "sensor_data_x.npz",
-            timestamps=truth.sensor_time,
-            forces=truth.sensor[:, 0],
-            alines=truth.sensor[:, 1:],
-        )
+    np.savez(
+        folder / "sensor_data_x.npz",
+        timestamps=truth.sensor_time,
+        forces=truth.sensor[:, 0],
+        alines=truth.sensor[:, 1:],
+    )
     for view in views:
         for frame, time in enumerate(truth.frame_time):
             write_jpeg(folder / view / f"zed_1_left_{time:.3f}.jpg", 40 * frame)
@@ -136,7 +133,6 @@ def write_old(
     folder: Path,
     truth: Truth,
     eyes: Sequence[str] = ("left",),
-    protocol: int = 4,
     **changes: Any,
 ) -> Path:
     images: dict[str, list[str]] = {"View3": []}
@@ -157,7 +153,7 @@ def write_old(
     }
     folder.mkdir(parents=True, exist_ok=True)
     with (folder / "data.pkl").open("wb") as file:
-        pickle.dump(document, file, protocol=protocol)
+        pickle.dump(document, file, protocol=4)
     return folder
 
 
@@ -338,7 +334,6 @@ def write() -> SimpleNamespace:
         png=png,
         jsonl=write_jsonl,
         edit_json=edit_json,
-        shaded=shaded,
         shade_of=shade_of,
         START=START,
         STATE_NAMES=STATE_NAMES,

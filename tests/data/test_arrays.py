@@ -45,16 +45,13 @@ def test_arrays_are_what_their_bytes_hold(tmp_path, content, message):
         assert "pickle" not in str(refused.value)
 
 
-@pytest.mark.parametrize(
-    ("at", "value", "message"), [(8, 1, "encrypted"), (10, 99, "method"), (16, 1, "CRC")]
-)
-def test_a_spoilt_archive_is_named(tmp_path, at, value, message):
+def test_an_encrypted_archive_is_named(tmp_path):
     path = tmp_path / "a.npz"
     np.savez(path, values=np.zeros(9999))
     content = bytearray(path.read_bytes())
-    struct.pack_into("<H", content, content.find(b"PK\1\2") + at, value)
+    struct.pack_into("<H", content, content.find(b"PK\1\2") + 8, 1)
     path.write_bytes(content)
-    with pytest.raises(RecordingError, match=rf"a\.npz, member 'values': .*{message}.*{MEND}"):
+    with pytest.raises(RecordingError, match=rf"a\.npz, member 'values': .*encrypted.*{MEND}"):
         read_npz(path, ["values"])
 
 
@@ -62,9 +59,7 @@ def test_a_spoilt_archive_is_named(tmp_path, at, value, message):
     ("text", "message"),
     [
         ("a,b\n1,2\n1_0,2\n", "Row #3: .*invalid value '1_0'"),
-        ("a,b\n1,١٢\n", "Row #2: .*invalid value"),
         ("a,b,a\n1,2,3\n", "expected one column a each; it has a, b, a"),
-        ("c\n", "expected one column a, b each; it has c"),
         ("a,b\n1," + "2" * 2**21 + "\n", f"cannot be read as CSV.*{MEND}"),
         ("a,b\n1,\n", "column 'b': no value in row 0"),
     ],
@@ -76,10 +71,6 @@ def test_a_table_is_bounded_and_holds_plain_numbers(tmp_path, text, message):
         read_csv(path, ["a", "b"])
 
 
-@pytest.mark.parametrize(
-    ("time", "message"),
-    [([0.0, 1e308], r"x: timestamp 1e\+308 in row 1"), ([np.nan], "x: timestamp nan in row 0")],
-)
-def test_no_clock_is_farther_than_any(time, message):
-    with pytest.raises(RecordingError, match=message):
-        check_clock(np.array(time), "x")
+def test_no_time_of_a_clock_is_nan():
+    with pytest.raises(RecordingError, match="x: timestamp nan in row 1"):
+        check_clock(np.array([0.0, np.nan]), "x")

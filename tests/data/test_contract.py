@@ -144,9 +144,3 @@ class TestRecordingContract:
                 assert np.array_equal(frames[-1], frames[-2])
                 alone = next(iter(recording.cameras()[view].read([last])))
                 assert np.array_equal(alone, frames[-1])
-
-    def test_skipping_frames_gives_the_same_frames(self, recordings: tuple[Recording, ...]):
-        for camera in recordings[-1].cameras().values():
-            every = list(camera.read(range(min(len(camera.time), 20))))
-            some = list(camera.read(range(0, len(every), 3)))
-            assert all(np.array_equal(a, b) for a, b in zip(every[::3], some, strict=True))

@@ -1,6 +1,5 @@
 """Finding the episodes of the params' sources."""
 
-import json
 import os
 from pathlib import Path
 
@@ -82,7 +81,7 @@ def test_an_explicit_format_is_taken_or_refused(root, format):
         names(root, other, format=format)
 
 
-def test_a_recording_names_its_group(root):
+def test_a_recording_names_its_group(root, write):
     def group():
         opened = open_recordings([Source(name="s", path="new")], root)
         if opened.bad:
@@ -90,11 +89,10 @@ def test_a_recording_names_its_group(root):
         return opened.recordings[0].group
 
     (path,) = (root / "new").rglob("metadata.json")
-    document = json.loads(path.read_text())
     assert group() is None
-    path.write_text(json.dumps(document | {"group": "monday"}))
+    write.edit_json(path, group="monday")
     assert group() == "monday"
-    path.write_text(json.dumps(document | {"group": ["monday"]}))
+    write.edit_json(path, group=["monday"])
     with pytest.raises(RecordingError, match=r"metadata\.json: group.*found \['monday'\]"):
         group()
 
@@ -107,11 +105,9 @@ def test_a_recording_names_its_group(root):
         ("a\0b", "matches nothing"),
         ("raw/Blue_point/e9/robot_state_x.csv", "matches nothing"),
         ("raw/Blue_point/e9/View1", "none with an episode.*metadata.json.*data.pkl.*meta/info"),
-        ("raw/empty", r"none with an episode.*convert another format to LeRobot.*reader\.md"),
     ],
 )
 def test_an_error_names_what_was_looked_for(root, path, message):
-    (root / "raw/empty").mkdir()
     with pytest.raises(RecordingError, match=f"source 's'.*{message}"):
         open_recordings([Source(name="s", path=path)], root)
 
@@ -163,10 +159,6 @@ def test_folders_are_searched_once_however_deep_and_often_linked(root):
     assert len(open_recordings([Source(name="s", path="raw", format="raw")], root).recordings)
 
 
-def names_no_file(path: Path) -> None:
-    path.symlink_to("nowhere")
-
-
 FILES = {
     "old": ("data.pkl", "View1/left/*.jpg"),
     "new": ("metadata.json", "sensor_data.npz", "robot_states.npz", "images/View1/*.jpg"),
@@ -177,7 +169,7 @@ FILES = {
 SPECIAL = [
     *((format, file, os.mkfifo, "a pipe") for format in FILES for file in FILES[format]),
     ("raw", "View1/*.jpg", Path.mkdir, "found a folder"),
-    ("new", "sensor_data.npz", names_no_file, "no such file"),
+    ("new", "sensor_data.npz", lambda path: path.symlink_to("nowhere"), "no such file"),
 ]
 
 

@@ -1,7 +1,6 @@
 """The old format: no clock, paths of another machine, and an unpickler that runs nothing."""
 
 import io
-import os
 import pickle
 from collections import OrderedDict
 from pathlib import Path
@@ -17,9 +16,9 @@ from pipeline.data.pickled import load_plain
 def old(tmp_path, write, truth, only):
     """`old(**entries)`: the recording of a pickle with these entries."""
 
-    def of(eyes=("left",), protocol=4, **entries):
+    def of(eyes=("left",), **entries):
         folder = tmp_path / "White_circle" / "recv_all_1"
-        return only(write.old(folder, truth, eyes, protocol, **entries))
+        return only(write.old(folder, truth, eyes, **entries))
 
     return of
 
@@ -28,9 +27,8 @@ def expect(time: np.ndarray, start: float, rate_hz: float) -> None:
     np.testing.assert_array_equal(time, start + np.arange(len(time)) / rate_hz)
 
 
-@pytest.mark.parametrize("protocol", [4, 5])
-def test_rows_are_at_t0_plus_k_by_rate(old, write, truth, protocol):
-    recording = old(protocol=protocol)
+def test_rows_are_at_t0_plus_k_by_rate(old, write, truth):
+    recording = old()
     action, sensor = recording.action(), recording.sensor()
     np.testing.assert_array_equal(action.values, truth.action)
     np.testing.assert_array_equal(sensor.values, truth.sensor[:5])
@@ -66,19 +64,13 @@ def test_two_eyes_are_two_views_and_t0_ignores_the_filter(old, write, only):
     assert filtered.action().time[0] == write.START
 
 
-@pytest.mark.parametrize(
-    ("recorded", "kept"),
-    [
-        ("/mnt/robot/recv_all_1/View1/left/z_{t}.jpg", "View1/left/z_{t}.jpg"),
-        ("C:\\data\\recv_all_1\\View1\\z_{t}.jpg", "View1/z_{t}.jpg"),
-    ],
-)
-def test_the_longest_tail_that_exists_is_taken(tmp_path, old, write, recorded, kept):
+def test_the_longest_tail_of_a_path_of_windows_is_taken(tmp_path, old, write):
     folder = tmp_path / "White_circle" / "recv_all_1"
     times = ["10.500", "10.600"]
     for time in times:
-        write.jpeg(folder / kept.format(t=time))
-    recording = old(eyes=(), image={"View1": [recorded.format(t=time) for time in times]})
+        write.jpeg(folder / f"View1/z_{time}.jpg")
+    recorded = [f"C:\\data\\recv_all_1\\View1\\z_{time}.jpg" for time in times]
+    recording = old(eyes=(), image={"View1": recorded})
     assert recording.cameras()["View1"].time.tolist() == [10.5, 10.6]
     assert recording.action().time[0] == 10.5
     assert all(folder in file.parents for file in recording.files())
@@ -198,38 +190,11 @@ def test_numpy_1_spelling_is_known(tmp_path):
     np.testing.assert_array_equal(load(path), np.arange(3.0))
 
 
-class Reduced:
-    """Pickles as a call with these arguments."""
-
-    def __init__(self, call, *arguments) -> None:
-        self.call, self.arguments = call, arguments
-
-    def __reduce__(self):
-        return self.call, self.arguments
-
-
 def global_call(module: str, name: str, *arguments: object) -> bytes:
     """A protocol-3 pickle that calls `module.name(*arguments)`."""
     body = io.BytesIO()
     pickle._Pickler(body, 3).save(arguments)  # type: ignore[attr-defined]
     return b"\x80\x03c" + f"{module}\n{name}\n".encode() + body.getvalue() + b"R."
-
-
-@pytest.mark.parametrize("protocol", [0, 4])
-@pytest.mark.parametrize(
-    "call",
-    [
-        lambda mark: Reduced(os.system, f"touch {mark}"),
-        lambda mark: Reduced(np.memmap, str(mark), "u1", "w+", 0, (4,)),
-    ],
-)
-def test_a_hostile_pickle_is_refused_and_nothing_runs(tmp_path, protocol, call):
-    mark = tmp_path / "mark.npy"
-    content = {"action": np.zeros((3, 7)), "extra": call(mark)}
-    path = save(tmp_path / "data.pkl", content, protocol)
-    with pytest.raises(RecordingError, match=r"data\.pkl: refused.*Nothing was executed"):
-        load(path)
-    assert not list(tmp_path.glob("mark*"))
 
 
 @pytest.mark.parametrize(
@@ -238,26 +203,21 @@ def test_a_hostile_pickle_is_refused_and_nothing_runs(tmp_path, protocol, call):
         ("posix", "system", ("touch {mark}",)),
         ("__builtin__", "eval", ("open('{mark}', 'w')",)),
         ("numpy", "load", ("{mark}",)),
+        ("numpy", "memmap", ("{mark}", "u1", "w+", 0, (4,))),
         ("numpy.testing._private.utils", "runstring", ("open('{mark}', 'w')", {})),
         ("numpy.core.multiarray", "os.system", ("touch {mark}",)),
-        ("numpy", "dtype", ("O",)),
+        ("numpy", "dtype", ("O8", False, True)),  # of an array of objects
         ("_codecs", "encode", ("x", "rot13")),
     ],
 )
-def test_names_that_look_innocent_are_refused(tmp_path, module, name, arguments):
+def test_a_hostile_pickle_is_refused_and_nothing_runs(tmp_path, module, name, arguments):
     mark = tmp_path / "mark"
     filled = [a.format(mark=mark) if isinstance(a, str) else a for a in arguments]
     path = tmp_path / "data.pkl"
     path.write_bytes(global_call(module, name, *filled))
-    with pytest.raises(RecordingError, match=r"data\.pkl: refused"):
+    with pytest.raises(RecordingError, match=r"data\.pkl: refused.*Nothing was executed"):
         load(path)
     assert not mark.exists()
-
-
-def test_an_array_of_objects_is_refused(tmp_path):
-    content = np.array([{"a": 1}, None], object)
-    with pytest.raises(RecordingError, match=r"refused.*dtype"):
-        load(save(tmp_path / "data.pkl", content))
 
 
 def test_what_a_pickle_sets_on_an_admitted_name_does_not_outlive_it(tmp_path):
@@ -282,7 +242,6 @@ def test_memory_of_another_array_is_not_shared(tmp_path):
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        (b"", "EOFError"),
         (pickle.dumps({"action": np.arange(100.0)})[:200], ""),
         (b"\x80\x02U\x05mesh1Q.", "UnpicklingError"),  # a persistent id
         (b"\x80\x05\x97.", "UnpicklingError"),  # a buffer out of band

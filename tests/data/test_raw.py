@@ -58,8 +58,6 @@ def in_whole_seconds(line: str) -> str:
         (lambda ls: [*ls[:4], ls[4].rsplit(",", 1)[0] + ",oops", *ls[5:]], "Row #5.*'oops'"),
         (lambda ls: [*ls[:4], ls[4].rsplit(",", 1)[0] + ",inf", *ls[5:]], "row 3, 0.0.*pose_r"),
         (lambda ls: [*ls[:-1], ls[-1][:60]], "Row #51: Expected 15 columns, got 5"),
-        (lambda ls: [*ls[:4], "0," + ls[4], *ls[5:]], "Row #5: Expected 15 columns, got 16"),
-        (lambda ls: [ls[0], ls[2], ls[1], *ls[3:]], "goes backwards at row 1"),
         (
             lambda ls: [ls[0], *map(in_whole_seconds, ls[1:])],
             "float64 near .* steps of 1 s, too coarse",
@@ -73,10 +71,6 @@ def test_a_spoilt_csv_is_named_with_its_place(folder, only, edit, message):
     path.write_text("\n".join(edit(path.read_text().splitlines())))
     with pytest.raises(RecordingError, match=rf"robot_state_x\.csv.*{message}"):
         only(folder).poses()
-
-
-def truncate(path: Path, truth) -> None:
-    path.write_bytes(path.read_bytes()[:-5000])
 
 
 def damage_member(path: Path, truth) -> None:
@@ -98,23 +92,14 @@ def rewrite(**changes):
     return write_again
 
 
-def with_nan(values: np.ndarray) -> np.ndarray:
-    values = values.copy()
-    values[17, 3] = np.nan
-    return values
-
-
 @pytest.mark.parametrize(
     ("spoil", "message"),
     [
-        (truncate, "cannot be read"),
         (damage_member, "member 'alines'.*cannot be read"),
         (rewrite(forces=lambda a: a[:-1]), "325 A-lines but forces of shape"),
         (rewrite(timestamps=lambda a: np.float32(a)), "steps of 128 s, too coarse"),
         (rewrite(alines=lambda a: None), "no member 'alines' or 'aline'"),
         (rewrite(alines=lambda a: a[:, :9]), r"\(N, 1025\).*\(325, 9\)"),
-        (rewrite(alines=with_nan), "nan in row 17.*aline_0003"),
-        (rewrite(forces=lambda a: a.astype(str)), "member 'forces'.*numbers"),
     ],
 )
 def test_a_spoilt_sensor_file_is_named_with_its_place(folder, truth, only, spoil, message):

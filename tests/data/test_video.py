@@ -162,7 +162,6 @@ NONE = r"cannot be read as video \(MP4, Matroska, WebM or AVI\): Invalid \w+.*Co
     ("make", "message"),
     [
         (playlist, NONE),
-        (lambda path: path.write_bytes(b""), NONE),
         (sound, "holds no video"),
         (
             lambda path: mjpeg(path, 40),

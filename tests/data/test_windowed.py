@@ -38,19 +38,14 @@ def test_joints_and_poses_make_a_state(folder, truth, only):
 
 
 @pytest.mark.parametrize(
-    ("format", "start_s", "end_s", "robot_hz"),
-    [("npz", 0, 0.5, 20), ("csv", -3600, 0.5, 100), ("npz", 3600, 0.5, 100), ("npz", 0, 1.2, 100)],
+    ("start_s", "end_s", "robot_hz"),
+    [(0, 0.5, 20), (-3600, 0.5, 100), (3600, 0.5, 100), (0, 1.2, 100)],
 )
-def test_a_made_clock_that_misses_the_end_is_refused(
-    folder, truth, write, only, format, start_s, end_s, robot_hz
-):
+def test_a_made_clock_that_misses_the_end_is_refused(folder, write, only, start_s, end_s, robot_hz):
     """Every row would have another time than it was recorded at, and pair with other frames."""
-    if format == "csv":
-        (folder / "robot_states.npz").unlink()
-        write.csv(folder / "robot_states.csv", write.STATE_NAMES, truth.state.tolist())
     start, end = write.START + start_s, write.START + end_s
     write.edit_json(folder / "metadata.json", start_time=start, end_time=end, robot_hz=robot_hz)
-    parts = (f"{format}: 50 rows.*robot_hz {robot_hz} ", f"{start:.3f}", f"{end:.3f}")
+    parts = (f"npz: 50 rows.*robot_hz {robot_hz} ", f"{start:.3f}", f"{end:.3f}")
     with pytest.raises(RecordingError, match=".*".join(parts)):
         only(folder).state()
 
@@ -122,7 +117,6 @@ def rewrite_states(**changes):
         (rewrite_states(robot_states=np.zeros((50, 11))), r"12 values.*\(50, 11\)"),
         (rewrite_states(robot_states=None, joints=None, poses=None), "expected robot_states"),
         (rewrite_states(joints=np.float32(1)), "'joints': expected rows of numbers, found float32"),
-        (rewrite_states(robot_states=np.full((50, 12), np.inf)), "inf in row 0.*joint_1"),
     ],
 )
 def test_spoilt_states_are_named(folder, truth, only, spoil, message):

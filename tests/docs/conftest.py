@@ -18,6 +18,13 @@ from pipeline.base.config import load_params
 
 ROOT = Path(__file__).resolve().parents[2]
 MACHINERY = ROOT / "docs" / "machinery"
+PAGES = [
+    *sorted((ROOT / "docs").rglob("*.md")),
+    *sorted(ROOT.glob("README*.md")),
+    ROOT / "CONTRIBUTING.md",
+    ROOT / "cache_store" / "README.md",
+]
+"""What the documentation consists of."""
 
 
 @pytest.fixture(scope="session")

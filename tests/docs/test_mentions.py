@@ -8,15 +8,9 @@ from pathlib import Path
 
 from pipeline.base.config import Params
 from pipeline.base.config.section import Section
+from tests.docs.conftest import PAGES, ROOT
 
-ROOT = Path(__file__).resolve().parents[2]
 STAGES = {path.stem for path in (ROOT / "stages").glob("*.py")} - {"__init__", "command"}
-PAGES = [
-    *sorted((ROOT / "docs").rglob("*.md")),
-    *sorted(ROOT.glob("README*.md")),
-    ROOT / "CONTRIBUTING.md",
-    ROOT / "cache_store" / "README.md",
-]
 WRITTEN_AT_BUILD = re.compile(r"(^|/)docs/reference/\w+\.md$")
 EXCUSED = re.compile(
     r"<!-- no-check: [^>]*-->\s*\n(?:```.*?^```$|.*?(?=\n\n|\Z))", re.DOTALL | re.MULTILINE
@@ -75,10 +69,3 @@ def test_every_link_within_the_project_resolves():
         place = (page.parent / target.partition("#")[0]).resolve()
         written = WRITTEN_AT_BUILD.search(place.as_posix())
         assert place.exists() or written, f"{page.relative_to(ROOT)} -> {target}"
-
-
-def test_a_wrong_name_would_be_found():
-    assert "nonsense" not in STAGES
-    assert KEY.findall("`vlm.nonsense`") == [("vlm", "nonsense")]
-    assert {"vlm.layers", "train_head.diffusion.eta", "inspect.path"} <= keys()
-    assert not EXCUSED.sub("", "<!-- no-check: x -->\n```\nstages.nonsense\n```").strip()

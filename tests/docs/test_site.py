@@ -1,7 +1,7 @@
 """The built site in a real browser, from a folder: no errors, no other host."""
 
 import re
-from collections.abc import Callable, Iterator
+from contextlib import closing
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -46,60 +46,33 @@ def test_every_link_and_anchor_is_there(site):
     assert not lost
 
 
-class Reader:
-    """A page in the browser, and what it did that it must not: errors, requests to another host."""
+@pytest.mark.parametrize("name", [*PAGES, *(pytest.param(n, marks=pytest.mark.slow) for n in MORE)])
+def test_a_page_loads_alone_and_fits_every_screen(site, browser, name):
+    """Nothing errs, and nothing but files is asked for."""
+    trouble: list[str] = []
 
-    def __init__(self, browser, **options) -> None:
-        self.trouble: list[str] = []
-        self.context = browser.new_context(**options)
-        self.page = self.context.new_page()
-        self.page.set_default_timeout(20_000)
-        self.page.on("console", self._heard)
-        self.page.on("pageerror", lambda error: self.trouble.append(str(error)))
-        self.context.route("**/*", self._only_files)
-
-    def _heard(self, said) -> None:
+    def heard(said) -> None:
         if said.type == "error":
-            self.trouble.append(said.text)
+            trouble.append(said.text)
 
-    def _only_files(self, route) -> None:
+    def only_files(route) -> None:
         if route.request.url.startswith("file:"):
             route.continue_()
         else:
-            self.trouble.append(f"asked for {route.request.url}")
+            trouble.append(f"asked for {route.request.url}")
             route.abort()
 
-
-@pytest.fixture
-def reader(browser) -> Iterator[Callable[..., Reader]]:
-    """`reader(**context)`: a reader, of whom nothing but files may have been asked in the end."""
-    readers: list[Reader] = []
-
-    def come(**options) -> Reader:
-        readers.append(Reader(browser, **options))
-        return readers[-1]
-
-    yield come
-    for one in readers:
-        one.context.close()
-    assert [trouble for one in readers for trouble in one.trouble] == []
-
-
-def open_page(visitor: Reader, path: Path) -> None:
-    visitor.page.goto(path.as_uri())
-    # What the page's scripts do at once, done.
-    visitor.page.wait_for_function("document.body.hasAttribute('data-md-color-scheme')")
-    assert not visitor.trouble, f"{path.name}: {visitor.trouble}"
-
-
-def width(visitor: Reader) -> int:
-    return visitor.page.evaluate("document.documentElement.scrollWidth")
-
-
-@pytest.mark.parametrize("name", [*PAGES, *(pytest.param(n, marks=pytest.mark.slow) for n in MORE)])
-def test_a_page_loads_alone_and_fits_every_screen(site, reader, name):
-    visitor = reader(viewport={"width": DESKTOP[0], "height": DESKTOP[1]})
-    open_page(visitor, site / f"{name}.html")
-    for size in (DESKTOP, PHONE):
-        visitor.page.set_viewport_size({"width": size[0], "height": size[1]})
-        assert width(visitor) <= size[0], f"{width(visitor)} px wide"
+    with closing(browser.new_context()) as context:
+        context.route("**/*", only_files)
+        page = context.new_page()
+        page.set_default_timeout(20_000)
+        page.on("console", heard)
+        page.on("pageerror", lambda error: trouble.append(str(error)))
+        page.goto((site / f"{name}.html").as_uri())
+        # What the page's scripts do at once, done.
+        page.wait_for_function("document.body.hasAttribute('data-md-color-scheme')")
+        for width, height in (DESKTOP, PHONE):
+            page.set_viewport_size({"width": width, "height": height})
+            taken = page.evaluate("document.documentElement.scrollWidth")
+            assert taken <= width, f"{taken} px wide"
+    assert trouble == []

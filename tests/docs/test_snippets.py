@@ -14,13 +14,8 @@ from typing import Any
 
 import pytest
 
-ROOT = Path(__file__).resolve().parents[2]
-PAGES = [
-    *sorted((ROOT / "docs").rglob("*.md")),
-    *sorted(ROOT.glob("README*.md")),
-    ROOT / "CONTRIBUTING.md",
-    ROOT / "cache_store" / "README.md",
-]
+from tests.docs.conftest import PAGES, ROOT
+
 BLOCK = re.compile(
     r"^(?P<marks>(?:<!-- [^>]*-->\s*\n)*)```python\n(?P<code>.*?)^```$", re.DOTALL | re.MULTILINE
 )

@@ -1,7 +1,6 @@
 """Predictions over a small store, without a policy."""
 
 from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,9 +18,7 @@ GROUPS = (
 
 
 @pytest.fixture(scope="session")
-def store(
-    tiny_store: Callable[..., Path], tmp_path_factory: pytest.TempPathFactory
-) -> FeatureStore:
+def store(tiny_store, tmp_path_factory) -> FeatureStore:
     return FeatureStore.open(tiny_store(tmp_path_factory.mktemp("evaluation")))
 
 

@@ -9,12 +9,7 @@ import pytest
 import torch
 
 from pipeline.base.config import SplitParams, TrainHeadParams
-from pipeline.evaluate.ablation import (
-    AblationStudy,
-    delays,
-    evaluate_ablation,
-    zeroed,
-)
+from pipeline.evaluate.ablation import AblationStudy, delays, evaluate_ablation, zeroed
 from pipeline.evaluate.baselines import Baselines
 from pipeline.evaluate.figures import rivalry
 from pipeline.policy.checkpoint import PolicyCheckpoint
@@ -96,23 +91,13 @@ def trained_store(tiny_store: Make, tmp_path_factory: pytest.TempPathFactory) ->
 
 @pytest.fixture(scope="module")
 def study(trained_store: FeatureStore) -> AblationStudy:
-    found = studied(trained_store, steps=120)
-    assert found is not None
-    return found
-
-
-def times(study: AblationStudy, stream: str, how: str) -> float:
-    (one,) = (one for one in study.ablated if (one.stream, one.how) == (stream, how))
-    ratio = study.times_intact(one)
-    assert ratio is not None
-    return ratio.value
+    return studied(trained_store, steps=120)
 
 
 def test_a_stream_that_decides_the_action_is_missed_and_others_are_not(study):
-    ratio = rivalry(study.intact).ratio
-    assert ratio is not None and ratio < 0.5
+    assert rivalry(study.intact).ratio < 0.5
     for ablated in study.ablated:
-        multiple = times(study, ablated.stream, ablated.how)
+        multiple = study.times_intact(ablated).value
         assert multiple > 2 if ablated.stream == "sensor" else multiple < 1.5, ablated.how
 
 
@@ -174,6 +159,5 @@ def test_the_time_between_episodes_is_no_step_of_ticks(tiny_store, tmp_path, tic
 def test_a_study_of_a_sampling_policy_is_of_few_samples(tiny_store: Make, tmp_path: Path) -> None:
     store = FeatureStore.open(tiny_store(tmp_path))
     many, few = (studied(store, model_type="flow_matching", samples=asked) for asked in (16, 4))
-    assert many is not None and few is not None
     assert many.samples == few.samples == 4
     assert few.intact.overall("policy") == many.intact.overall("policy")

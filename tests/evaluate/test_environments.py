@@ -76,10 +76,9 @@ def driven(names: Any, act: Any = None, **source: Any) -> tuple[Rollouts, Glance
     wanted = RolloutParams.model_validate(
         {"environment": names, "episodes": 3, "chunking": "none", "ablations": ["features off"]}
     )
-    load: Any = lambda: glance  # noqa: E731
     if act is not None:
         policy.act = act
-    return roll_out(cart, "models/cart", policy, load, wanted), glance
+    return roll_out(cart, "models/cart", policy, lambda: glance, wanted), glance
 
 
 def towards_the_middle(observation: Any, *_: Any) -> torch.Tensor:

@@ -16,36 +16,16 @@ from pipeline.policy.policy import Policy
 from pipeline.simulation.environment import InsertionEnvironment
 from pipeline.simulation.insertion import INSTRUCTION, MAX_TICKS, NeedleInsertion
 from pipeline.simulation.rendering import VIEWS, photograph
-from tests.robot.conftest import SOURCE, Glance
+from tests.robot.conftest import SOURCE, Glance, watch
 from tests.robot.conftest import build_policy as made
 
 ACTION = SOURCE["streams"]["action"]
 
 
-def watch(monkeypatch: pytest.MonkeyPatch, policy: Policy) -> list[dict[str, np.ndarray]]:
-    """What the policy is given in each pass, by field (robot, …); it grows with every pass."""
-    given, observe = list[dict[str, np.ndarray]](), policy.observe
-
-    def watched(streams: Any) -> Any:
-        given.append({name: np.array(value) for name, value in streams.items()})
-        return observe(streams)
-
-    monkeypatch.setattr(policy, "observe", watched)
-    return given
-
-
-def wanted(**changed: Any) -> RolloutParams:
-    return RolloutParams.model_validate({"episodes": 3, "seed": 77} | changed)
-
-
 def rolled(parts: tuple[PolicyCheckpoint, Policy, Glance], **changed: Any) -> Rollouts:
     checkpoint, policy, glance = parts
-    load: Any = lambda: glance  # noqa: E731
-    return roll_out(checkpoint, "models/head", policy, load, wanted(**changed))
-
-
-def figures(rollouts: Rollouts) -> list[Any]:
-    return [rollouts.document(), *(rollouts.table(kind).csv() for kind in (True, False))]
+    wanted = RolloutParams.model_validate({"episodes": 3, "seed": 77} | changed)
+    return roll_out(checkpoint, "models/head", policy, lambda: glance, wanted)
 
 
 @pytest.fixture(scope="module")
@@ -204,7 +184,6 @@ def test_an_action_that_is_no_number_stops_its_robot_alone(monkeypatch: pytest.M
 @pytest.mark.parametrize(
     ("source", "said"),
     [
-        ({"action_hz": 30.0}, "action_hz 30, of phantom"),
         ({"streams": {"action": ACTION, "views": ["View1", "View4"]}}, "View4"),
         ({"streams": {"action": ACTION | {"kind": "absolute"}, "views": []}}, "absolute"),
     ],

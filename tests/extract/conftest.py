@@ -22,7 +22,7 @@ from PIL import Image
 from pipeline.base.config import Params
 from pipeline.extract import extract
 from pipeline.extract.build_state import StorePlaces
-from pipeline.store import FeatureStore
+from pipeline.store import FeatureStore, StoreBuild
 from pipeline.store.schema import ARRAY_NAMES
 from pipeline.vlm.qwen import FrozenVLM
 
@@ -166,12 +166,6 @@ def params_file(document: dict[str, Any], tmp_path: Path) -> Path:
     return path
 
 
-def contents(folder: Path) -> dict[str, bytes]:
-    """Every file of a folder."""
-    files = (path for path in folder.rglob("*") if path.is_file())
-    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in files}
-
-
 def run(params: Params) -> tuple[Any, list[str]]:
     """The report of an extraction and the lines that it printed."""
     lines: list[str] = []
@@ -203,6 +197,44 @@ def counted(monkeypatch: pytest.MonkeyPatch) -> list[int]:
 
     monkeypatch.setattr(FrozenVLM, "submit", submit)
     return rows
+
+
+@pytest.fixture
+def no_model_later(monkeypatch: pytest.MonkeyPatch) -> Callable[[], None]:
+    """A call makes loading the model an error."""
+
+    def refuse(*args: Any, **kwargs: Any) -> None:
+        raise AssertionError("nothing needs the model")
+
+    return partial(monkeypatch.setattr, FrozenVLM, "load", refuse)
+
+
+@pytest.fixture
+def no_model(no_model_later: Callable[[], None]) -> None:
+    """Loading the model is an error."""
+    no_model_later()
+
+
+@pytest.fixture
+def interrupted(monkeypatch: pytest.MonkeyPatch) -> Callable[[Params, int], None]:
+    """`interrupted(params, rows)` stops as Ctrl-C does once this many rows are committed."""
+
+    def stop(params: Params, rows: int) -> None:
+        done: list[int] = []
+        real = StoreBuild.mark
+
+        def mark(self: StoreBuild, numbers: Any, *rest: Any) -> None:
+            real(self, numbers, *rest)
+            done.extend(numbers)
+            if len(done) >= rows:
+                raise KeyboardInterrupt
+
+        with monkeypatch.context() as patch:
+            patch.setattr(StoreBuild, "mark", mark)
+            with pytest.raises(KeyboardInterrupt):
+                run(params)
+
+    return stop
 
 
 @pytest.fixture

@@ -23,8 +23,8 @@ from pipeline.store.merging import merge
 from pipeline.store.proofs import Loss, Proof, proof_of, slots_digest, write_proofs
 from pipeline.store.schema import BASIS, read_spec
 from pipeline.store.verification import verify
-
-from .conftest import contents, run
+from tests.extract.conftest import run
+from tests.store.samples import content
 
 PROJECTED = {"dtype": {"pca": 12, "then": "int8"}}
 
@@ -84,14 +84,11 @@ def test_the_same_recordings_give_the_same_basis_to_the_bit(projected, monkeypat
 
 
 def test_a_basis_outlives_a_kill_new_recordings_damage_and_copies(
-    projected, changed, write_episode, recordings, monkeypatch, tmp_path
+    projected, changed, interrupted, write_episode, recordings, monkeypatch, tmp_path
 ):
     params, _ = projected
     path = params.extract.store
-    with monkeypatch.context() as patch:
-        patch.setattr("pipeline.extract.run.fill", _killed)
-        with pytest.raises(KeyboardInterrupt):
-            run(params)
+    interrupted(params, 1)
     begun = read_rows(part := part_path(path), read_spec(part, BASIS))
     monkeypatch.setattr("pipeline.extract.basis.fit_basis", None)  # nothing fits one from here on
     run(params)
@@ -108,7 +105,7 @@ def test_a_basis_outlives_a_kill_new_recordings_damage_and_copies(
 
     archive(path, tmp_path / "few.archive.zarr", 1, 1)
     restore(tmp_path / "few.archive.zarr", tmp_path / "again.zarr", 1)
-    assert contents(tmp_path / "again.zarr") == contents(path)
+    assert content(tmp_path / "again.zarr") == content(path)
 
     damaged = np.memmap(path / "vl/features/c/0/0/0", np.uint8, "r+")
     damaged[:8] ^= 0xFF
@@ -117,10 +114,6 @@ def test_a_basis_outlives_a_kill_new_recordings_damage_and_copies(
     assert report.computed >= 1
     assert verify(path).sound
     assert not reextract(path, changed(verify={"reextract": 3}, extract=PROJECTED), print).beyond
-
-
-def _killed(*_):
-    raise KeyboardInterrupt
 
 
 def test_a_damaged_basis_is_fitted_again(projected):

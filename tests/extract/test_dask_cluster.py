@@ -12,7 +12,6 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from itertools import pairwise
 from multiprocessing.context import ForkServerContext
 from pathlib import Path
 from urllib.error import HTTPError
@@ -23,20 +22,13 @@ import numpy as np
 import pytest
 from distributed import LocalCluster, Security, rpc
 
-from pipeline.base import errors
-from pipeline.base.config import Params
 from pipeline.base.digests import ContentDigests, file_digest, ledger_path
-from pipeline.base.errors import (
-    ConfigError,
-    PipelineError,
-    RecordingError,
-    VLMError,
-)
+from pipeline.base.errors import ConfigError, PipelineError, RecordingError, VLMError
 from pipeline.extract.dask_cluster import ExtractionPlugin, connected
 from pipeline.extract.survey import Survey, survey
-from pipeline.store import FeatureStore, RowSource, StoreBuild, part_path
+from pipeline.store import FeatureStore, StoreBuild
 from pipeline.vlm.feature_spec import feature_spec
-from tests.extract.conftest import Process, assert_same, missing_of, run
+from tests.extract.conftest import assert_same, missing_of, run
 
 BATCH = 4
 PATIENCE_S = 200
@@ -117,7 +109,6 @@ class Workers:
 
     cluster: LocalCluster
     control: Path
-    preload: Path
 
     @property
     def address(self) -> str:
@@ -172,7 +163,7 @@ def two_workers(forked: None, tmp_path_factory: pytest.TempPathFactory) -> Itera
             preload=str(preload),
         ) as cluster,
     ):
-        yield Workers(cluster, control, preload)
+        yield Workers(cluster, control)
 
 
 @pytest.fixture
@@ -182,12 +173,10 @@ def workers(two_workers: Workers) -> Workers:
     return two_workers
 
 
-@pytest.fixture(scope="module")
-def here(make_document, tmp_path_factory) -> FeatureStore:
+@pytest.fixture
+def here(extracted_once) -> FeatureStore:
     """The store that this process makes of the same recordings."""
-    params = Params.model_validate(make_document(tmp_path_factory.mktemp("here")))
-    run(params)
-    return FeatureStore.open(params.extract.store)
+    return FeatureStore.open(extracted_once)
 
 
 def reached_by_others(address: str) -> bool:
@@ -246,9 +235,8 @@ class TestDeaths:
         workers.ask("kill")  # one that computes when all that it did before is marked
         params = changed(vlm=pages, extract={"workers": workers.address})
         run(params)
-        assert_same(
-            FeatureStore.open(params.extract.store), FeatureStore.open(expected.extract.store)
-        )
+        stores = [FeatureStore.open(made.extract.store) for made in (params, expected)]
+        assert_same(*stores)
         times, _ = workers.computed()
         assert 1 <= times.total() - len(times) <= BATCH
 
@@ -264,9 +252,8 @@ class TestDeaths:
             run(params)
         said = str(raised.value)
         assert "a frame of episode_1 cannot be read" in said
-        assert said.count("every worker died that computed them alone") == 1, (
-            "its neighbour is not blamed"
-        )
+        deaths = said.count("every worker died that computed them alone")
+        assert deaths == 1, "its neighbour is not blamed"
         assert "episode_4, VL row" in said
         tried = workers.tried()
         # Of two ranges: a death may take one away before it begins, or its answer with it.
@@ -274,29 +261,20 @@ class TestDeaths:
         assert 2 <= tried["episode_3"] <= 4
         done = set(workers.computed()[0])
         missing = missing_of(params.extract.store)
-        edges = self.edges(params.extract.store)
-        assert not missing & set(edges["episode_2"])
-        for name in ("episode_1", "episode_3", "episode_4"):
-            assert missing >= set(edges[name])
-
         workers.forget()
         run(params)
+        store = FeatureStore.open(params.extract.store)
+        rows = {Path(one.id).name: set(one.vl_rows) for one in store.episodes}
+        assert not missing & rows["episode_2"]
+        for name in ("episode_1", "episode_3", "episode_4"):
+            assert missing >= rows[name]
         times, _ = workers.computed()
         assert set(times) == missing
         assert set(times.values()) == {1}
         assert done - missing
         expected = changed(extract={"store": str(tmp_path / "expected.zarr")})
         run(expected)
-        assert_same(
-            FeatureStore.open(params.extract.store), FeatureStore.open(expected.extract.store)
-        )
-
-    def edges(self, store: Path) -> dict[str, range]:
-        build = RowSource(part_path(store))
-        starts = build._read("episode/vl_start")
-        names = [Path(text.id).name for text in build.texts]
-        spans = [range(*edges) for edges in pairwise(starts.tolist())]
-        return dict(zip(names, spans, strict=True))
+        assert_same(store, FeatureStore.open(expected.extract.store))
 
 
 class TestRefusals:
@@ -344,13 +322,9 @@ class TestRefusals:
             assert ExtractionPlugin(surveyed, ()).device_of(name) == device
 
     def test_errors_survive_the_way_from_a_worker(self):
-        children = [
-            kind
-            for kind in vars(errors).values()
-            if isinstance(kind, type) and issubclass(kind, PipelineError)
-        ]
-        assert len(children) > 8
-        for kind in children:
+        kinds = PipelineError, *PipelineError.__subclasses__()
+        assert len(kinds) > 8
+        for kind in kinds:
             back = pickle.loads(pickle.dumps(kind("what, where, what to run")))
             assert type(back) is kind
             assert str(back) == "what, where, what to run"
@@ -359,12 +333,13 @@ class TestRefusals:
 class TestScheduler:
     @pytest.mark.slow
     def test_a_killed_scheduler_is_said_and_the_next_run_completes(
-        self, changed, here, tmp_path, monkeypatch, begun
+        self, changed, here, tmp_path, monkeypatch, begin
     ):
         address_file = tmp_path / "scheduler.json"
         options = ["--scheduler-file", str(address_file)]
-        scheduler = begun("scheduler", "--port", "0", "--no-dashboard", *options)
-        worker = begun("worker", *WORKER, *options)
+        listening = "--port", "0", "--no-dashboard", *options
+        scheduler = begin(DASK.format(role="scheduler"), tmp_path, *listening)
+        worker = begin(DASK.format(role="worker"), tmp_path, *WORKER, *options)
         mark = StoreBuild.mark
         marked: list[int] = []
 
@@ -507,14 +482,8 @@ TWO = ("--set", "extract.workers=2")
 WORKER = ("--nthreads", "2", "--no-nanny", "--death-timeout", "60", "--no-dashboard")
 
 
-@pytest.fixture
-def begun(begin: Callable[..., Process], tmp_path: Path) -> Callable[..., Process]:
-    """`begun(role, ...)`: a process of dask's command line."""
-
-    def begin_role(role: str, *options: str) -> Process:
-        return begin(f"from distributed.cli.dask_{role} import main\nmain()", tmp_path, *options)
-
-    return begin_role
+DASK = "from distributed.cli.dask_{role} import main\nmain()"
+"""A process of dask's command line."""
 
 
 def wait_for(true: Callable[[], bool], process) -> None:

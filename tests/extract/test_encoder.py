@@ -1,7 +1,7 @@
 """Rows -> batches -> features: grouping, one batch ahead, out of memory, what is not finite."""
 
 import dataclasses
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -33,6 +33,7 @@ class FakePending:
         return features.to(self.vlm.dtype), None
 
 
+@dataclass
 class FakeVLM:
     """Says of each row its pixel value in both slots; refuses more rows than it has memory for.
 
@@ -40,20 +41,12 @@ class FakeVLM:
     """
 
     device = torch.device("cpu")
-
-    def __init__(
-        self,
-        room: int = 10**6,
-        dtype: torch.dtype = torch.float32,
-        overhead_s: float = 0.0,
-        synchronous: bool = False,
-    ) -> None:
-        self.room = room
-        self.dtype = dtype
-        self.overhead_s = overhead_s
-        self.synchronous = synchronous
-        self.batches: list[int] = []
-        self.log: list[str] = []
+    room: int = 10**6
+    dtype: torch.dtype = torch.float32
+    overhead_s: float = 0.0
+    synchronous: bool = False
+    batches: list[int] = field(default_factory=list)
+    log: list[str] = field(default_factory=list)
 
     def submit(self, rows: list[PreparedRow]) -> FakePending:
         self.batches.append(len(rows))
@@ -78,8 +71,7 @@ def ready(row: int, values: list[int], length: int = 1) -> ReadyRow:
 
 
 def encoder_of(vlm: FakeVLM, batch_size: Any, variants: int = K) -> Encoder:
-    fake: Any = vlm
-    return Encoder(fake, batch_size, variants)
+    return Encoder(vlm, batch_size, variants)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(

@@ -36,17 +36,9 @@ class TestEqualRows:
         assert np.allclose(store.array("vl/features"), each.array("vl/features"), atol=2e-5)
         assert store.attrs["environment"] == each.attrs["environment"]
 
-    def test_go_on_after_a_kill(self, params, recordings, stand_still, monkeypatch):
+    def test_go_on_after_a_kill(self, params, recordings, stand_still, interrupted):
         stand_still(recordings / "Touch_dot" / "episode_2")
-        real = StoreBuild.mark
-
-        def mark(self, rows, *rest):
-            real(self, rows, *rest)
-            raise KeyboardInterrupt
-
-        with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
-            patch.setattr(StoreBuild, "mark", mark)
-            run(params)[0]
+        interrupted(params, 1)
         report = run(params)[0]
         assert report.taken == 0
         assert report.computed + report.repeated == report.rows - params.extract.batch_size

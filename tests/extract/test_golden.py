@@ -15,12 +15,6 @@ from pipeline.store.chunks import write_seal
 from pipeline.store.golden_rows import GOLDEN
 from pipeline.store.verification import verify
 from pipeline.vlm.preparation import Preparer
-from pipeline.vlm.qwen import FrozenVLM
-from tests.extract.conftest import contents
-
-
-def quiet(line: str) -> None:
-    """What is said is not looked at."""
 
 
 def assert_golden(params: Params) -> FeatureStore:
@@ -43,32 +37,20 @@ def forget_golden(params: Params) -> None:
     write_seal(params.extract.store)
 
 
-def decode_otherwise(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Today's decoder gives other pixels than that of the store."""
-    real = Image.Image.convert
-    monkeypatch.setattr(
-        Image.Image,
-        "convert",
-        lambda *args, **kw: real(*args, **kw).point(lambda value: min(255, value + 8)),
-    )
-
-
-def without_model(*args: object, **kwargs: object) -> None:
-    raise AssertionError("nothing needs the model")
-
-
 class TestBuilds:
     def test_a_fresh_build(self, params, extracted):
         store = assert_golden(params)
         preparer, golden = Preparer(params.vlm, _Views()), store.golden[0]
-        assert golden.instruction == store.episodes[_episode(store, 0)].instruction
+        row = store.attrs[GOLDEN][0]["row"]
+        (episode,) = (episode for episode in store.episodes if row in episode.vl_rows)
+        assert golden.instruction == episode.instruction
         assert golden.prompt == preparer.render(golden.instruction, [*golden.frames])
         names = [name for name, _ in zarr.open_group(store.path, mode="r").members(max_depth=None)]
         assert {f"golden/{n}/View{view}" for n in range(4) for view in (1, 2)} <= {*names}
 
     @pytest.mark.parametrize("carried", [True, False])
     def test_of_rows_that_are_taken_over_those_four_alone_are_decoded_and_only_once(
-        self, params, changed, extracted, monkeypatch, carried
+        self, params, changed, extracted, no_model, monkeypatch, carried
     ):
         """Where the store before has them, not even those."""
         if not carried:
@@ -80,9 +62,8 @@ class TestBuilds:
             decoded.extend(self.rows.tolist())
             return real(self)
 
-        monkeypatch.setattr(FrozenVLM, "load", without_model)
         monkeypatch.setattr(RowRange, "read", read)
-        report = extract(changed(extract={"sensor_dtype": "float16"}), quiet)
+        report = extract(changed(extract={"sensor_dtype": "float16"}), print)
         assert report is not None and report.taken == report.rows
         store = assert_golden(params)
         assert decoded == ([] if carried else [entry["row"] for entry in store.attrs[GOLDEN]])
@@ -91,7 +72,12 @@ class TestBuilds:
         self, params, changed, extracted, monkeypatch
     ):
         forget_golden(params)
-        decode_otherwise(monkeypatch)
+        real = Image.Image.convert
+        monkeypatch.setattr(
+            Image.Image,
+            "convert",
+            lambda *args, **kw: real(*args, **kw).point(lambda value: min(255, value + 8)),
+        )
         said: list[str] = []
         extract(changed(extract={"sensor_dtype": "float16"}), said.append)
         assert any(line.startswith("4 golden row(s) left out: decoded") for line in said)
@@ -101,22 +87,9 @@ class TestBuilds:
         assert verify(store.path).sound
 
 
-class TestStoreBefore:
-    """Its golden rows prove themselves, whatever today's decoder gives."""
-
-    def test_they_are_carried_where_the_decoder_gives_other_pixels(
-        self, params, changed, extracted, monkeypatch
-    ):
-        before = contents(params.extract.store / GOLDEN)
-        decode_otherwise(monkeypatch)
-        extract(changed(extract={"sensor_dtype": "float16"}), quiet)
-        assert_golden(params)
-        assert contents(params.extract.store / GOLDEN) == before
-
-
 class TestKills:
     @pytest.mark.parametrize("frames", [3, 8])
-    def test_a_kill_while_they_are_written(self, params, monkeypatch, frames):
+    def test_a_kill_while_they_are_written(self, params, monkeypatch, no_model_later, frames):
         """With so many frames written; 8 is after the last, before sealing."""
         written = iter(range(100))
 
@@ -124,29 +97,28 @@ class TestKills:
 
         real = golden_rows._write_frame
 
-        def killed(*args):
+        def killed(*args, **kwargs):
             if next(written) == frames:
                 raise KeyboardInterrupt
             real(*args)
 
         with monkeypatch.context() as patch:
             patch.setattr(golden_rows, "_write_frame", killed)
-            patch.setattr(StoreBuild, "seal", _raise)
+            patch.setattr(StoreBuild, "seal", killed)
             with pytest.raises(KeyboardInterrupt):
-                extract(params, quiet)
+                extract(params, print)
         assert not params.extract.store.exists()
-        monkeypatch.setattr(FrozenVLM, "load", without_model)
-        extract(params, quiet)
+        no_model_later()
+        extract(params, print)
         assert_golden(params)
 
 
-def test_a_repair_writes_them_anew(params, extracted, monkeypatch):
+def test_a_repair_writes_them_anew(params, extracted, no_model):
     store = params.extract.store
     before = FeatureStore.open(store).golden
     (store / "golden/2/View1/c/0/0/0").write_bytes(b"rot")
     assert not verify(store).sound
-    monkeypatch.setattr(FrozenVLM, "load", without_model)
-    extract(params, quiet, repair=True)
+    extract(params, print, repair=True)
     after = assert_golden(params).golden
     assert [golden.key for golden in after] == [golden.key for golden in before]
 
@@ -156,12 +128,3 @@ class _Views:
 
     views = ("View1", "View2")
     variants = 1
-
-
-def _raise(*args: object, **kwargs: object) -> None:
-    raise KeyboardInterrupt
-
-
-def _episode(store: FeatureStore, number: int) -> int:
-    row = store.attrs[GOLDEN][number]["row"]
-    return next(episode.index for episode in store.episodes if row in episode.vl_rows)

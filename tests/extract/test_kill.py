@@ -9,7 +9,6 @@ from contextlib import closing
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import google_crc32c
 import pytest
@@ -19,7 +18,7 @@ from pipeline.base.config import Params
 from pipeline.extract import extract
 from pipeline.extract.build_state import StorePlaces
 from pipeline.store import FeatureStore, part_path
-from tests.extract.conftest import assert_same
+from tests.extract.conftest import assert_same, run
 
 BATCH = 2
 IN_FLIGHT = 3
@@ -97,7 +96,11 @@ def killed_runs(
         sign = chance.choice(["build", "batch"]) if number else "mark"
         arguments = log, mark, batches, "--params", params
         process = begin(COUNTED, folder, *map(str, arguments))
-        midway = killed_once(process, signs[sign], chance.uniform(0.0, 0.2))
+        while process.poll() is None and not signs[sign]():
+            time.sleep(0.002)
+        time.sleep(chance.uniform(0.0, 0.2))
+        midway = process.poll() is None
+        process.kill()
         sessions.append(Killed(computed_of(log) - computed, marked_of(store) - marked, midway))
     before = marked_of(store)
     report = extract(Params.model_validate(document_of(document, store)), lambda line: None)
@@ -107,17 +110,6 @@ def killed_runs(
 
 def grown(log: Path, size: int) -> bool:
     return log.stat().st_size > size
-
-
-def killed_once(process: Any, sign: Callable[[], bool], delay_s: float) -> bool:
-    """Whether it was still at work when the kill came."""
-    while process.poll() is None and not sign():
-        time.sleep(0.002)
-    time.sleep(delay_s)
-    if midway := process.poll() is None:
-        os.kill(process.pid, signal.SIGKILL)
-    process.wait()
-    return midway
 
 
 def computed_of(log: Path) -> int:
@@ -186,7 +178,6 @@ def test_sigterm_stops_cleanly_and_the_next_run_continues(begin, document, undis
     os.kill(process.pid, signal.SIGTERM)
     assert process.wait() == 1
     assert process.stderr.read_text() == "stopped; run the same command again\n"
-    said: list[str] = []
-    extract(Params.model_validate(document_of(document, store)), said.append)
+    _, said = run(Params.model_validate(document_of(document, store)))
     assert "continuing the interrupted build" in said[0]
     assert_equal_stores(FeatureStore.open(store), undisturbed)

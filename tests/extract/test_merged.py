@@ -6,11 +6,10 @@ from pipeline.base.errors import StoreMismatch
 from pipeline.extract import extract
 from pipeline.store import FeatureStore
 from pipeline.store.merging import merge
-from pipeline.vlm.qwen import FrozenVLM
 
 
 def test_a_merged_store_gives_every_row_to_an_extraction_of_all_sources(
-    changed, recordings, tmp_path, monkeypatch: pytest.MonkeyPatch
+    changed, recordings, tmp_path, no_model_later
 ):
     """Both views in both, for the union of views is part of a feature's identity."""
     sources = [
@@ -30,10 +29,7 @@ def test_a_merged_store_gives_every_row_to_an_extraction_of_all_sources(
         extract(only_first, print)
     assert FeatureStore.open(target).attrs["plan"] == merged.attrs["plan"], "nothing was replaced"
 
-    def refuse(*args, **kwargs):
-        raise AssertionError("nothing needs the model")
-
-    monkeypatch.setattr(FrozenVLM, "load", refuse)
+    no_model_later()
     report = extract(changed(data={"sources": sources}, extract={"store": str(target)}), print)
     assert (report.computed, report.taken) == (0, report.rows)
     after = FeatureStore.open(target)

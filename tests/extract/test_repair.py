@@ -1,6 +1,5 @@
 """Damage of every kind, found and repaired: the store is the undamaged one again."""
 
-import json
 import shutil
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,9 +13,10 @@ from pipeline.base.config import Params
 from pipeline.base.errors import StoreIncomplete, StoreMismatch
 from pipeline.extract import ExtractionReport, extract
 from pipeline.store import FeatureStore, StoreBuild, part_path
-from pipeline.store.schema import chunk_paths, read_spec
+from pipeline.store.schema import read_spec
 from pipeline.store.verification import verify
-from tests.extract.conftest import contents, run
+from tests.extract.conftest import run
+from tests.store.samples import chunk_file, content, edit, flip
 
 
 @pytest.fixture(scope="module")
@@ -44,10 +44,8 @@ class Case:
         return self.params.extract.store
 
     def flip(self, array: str, byte: int) -> Path:
-        (path, *_) = chunk_paths(self.store, read_spec(self.store, array))
-        content = bytearray(path.read_bytes())
-        content[byte] ^= 0x20
-        path.write_bytes(content)
+        path = chunk_file(self.store, array)
+        flip(path, byte, 5)
         return path
 
     def mended(self) -> ExtractionReport:
@@ -84,7 +82,7 @@ def test_damage_is_found_and_mended_to_the_byte(case, harm, computed):
     assert any(str(place) in issue for issue in verify(case.store).issues)
     report = case.mended()
     assert (report.computed, report.taken) == (computed, 24 - computed)
-    assert contents(case.store) == contents(case.original)
+    assert content(case.store) == content(case.original)
     assert extract(case.params, print) is None, "up to date"
     assert sorted(path.name for path in case.store.parent.glob("copy.zarr*/")) == ["copy.zarr"]
 
@@ -93,49 +91,39 @@ def test_metadata_of_the_features_that_are_lost_cost_the_rows(case):
     (case.store / "vl" / "features" / "zarr.json").unlink()
     report = case.mended()
     assert report.computed == report.rows
-    assert contents(case.store) == contents(case.original)
+    assert content(case.store) == content(case.original)
 
 
-@pytest.mark.parametrize("place", ["zarr.json", "vl/zarr.json"])
-def test_changed_metadata_are_written_again_and_every_row_is_kept(case, place):
-    document = json.loads((case.store / place).read_text())
-    attributes = document["attributes"]
-    if place == "zarr.json":
-        attributes["action_hz"] = 30.0
-    else:
-        attributes["slots"][0]["pooling"] = "last"
-    (case.store / place).write_text(json.dumps(document))
+def test_changed_metadata_are_written_again_and_every_row_is_kept(case):
+    edit(case.store / "zarr.json", lambda document: document["attributes"].update(action_hz=30.0))
+    edit(case.store / "vl/zarr.json", lambda document: document["attributes"].clear())
     with pytest.raises(StoreIncomplete, match="the metadata were changed"):
         run(case.params)
     assert case.mended().computed == 0
-    assert contents(case.store) == contents(case.original)
+    assert content(case.store) == content(case.original)
 
 
 def test_features_and_checksums_of_an_older_copy_are_not_taken(case):
     """They fit each other, but belong to other keys."""
     for array in ("vl/features", "vl/checksum"):
         spec = read_spec(case.store, array)
-        (path, *_) = chunk_paths(case.store, spec)
-        content, used = path.read_bytes()[:-4], spec.shape[0] * spec.row_bytes
-        content = content[spec.row_bytes : used] + content[: spec.row_bytes] + content[used:]
-        path.write_bytes(content + google_crc32c.value(content).to_bytes(4, "little"))
+        path = chunk_file(case.store, array)
+        rows, used = path.read_bytes()[:-4], spec.shape[0] * spec.row_bytes
+        rows = rows[spec.row_bytes : used] + rows[: spec.row_bytes] + rows[used:]
+        path.write_bytes(rows + google_crc32c.value(rows).to_bytes(4, "little"))
     assert case.mended().computed == 24
-    assert contents(case.store) == contents(case.original)
+    assert content(case.store) == content(case.original)
 
 
 def test_lost_checksums_cost_the_rows(case):
-    (path, *_) = chunk_paths(case.store, read_spec(case.store, "vl/checksum"))
-    path.unlink()
+    chunk_file(case.store, "vl/checksum").unlink()
     assert case.mended().computed == 24
-    assert contents(case.store) == contents(case.original)
+    assert content(case.store) == content(case.original)
 
 
-def test_arrays_of_other_lengths_are_found_and_mended(case):
-    path = case.store / "vl" / "checksum" / "zarr.json"
-    path.write_text(json.dumps(json.loads(path.read_text()) | {"shape": [3]}))
+def test_arrays_of_other_lengths_are_found(case):
+    edit(case.store / "vl/checksum/zarr.json", lambda document: document.update(shape=[3]))
     assert any("metadata were changed" in issue for issue in verify(case.store).issues)
-    case.mended()
-    assert contents(case.store) == contents(case.original)
 
 
 def test_other_params_repair_nothing(case):
@@ -149,7 +137,7 @@ def test_other_params_repair_nothing(case):
 def test_a_repair_that_was_stopped_is_completed_by_any_run(case, monkeypatch):
     """The damaged store stays until then, and a map of it afterwards."""
     flipped_feature(case)
-    before, mapped = contents(case.store), FeatureStore.open(case.store).array("vl/features")
+    before, mapped = content(case.store), FeatureStore.open(case.store).array("vl/features")
     rows = mapped[4:8].copy()
 
     def stop(*_: object, **__: object) -> None:
@@ -158,11 +146,11 @@ def test_a_repair_that_was_stopped_is_completed_by_any_run(case, monkeypatch):
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
         patch.setattr(StoreBuild, "seal", stop)
         case.mended()
-    assert contents(case.store) == before
+    assert content(case.store) == before
     report, said = run(case.params)
     assert report.computed == 0
     assert any("continuing the interrupted build" in line for line in said)
-    assert contents(case.store) == contents(case.original)
+    assert content(case.store) == content(case.original)
     assert np.array_equal(mapped[4:8], rows)
 
 

@@ -12,19 +12,16 @@ from pipeline.base.config import Params
 from pipeline.base.errors import StoreMismatch
 from pipeline.extract import extract
 from pipeline.extract.row_check import Reextraction, reextract
-from pipeline.store.schema import chunk_paths, read_spec
+from pipeline.store import FeatureStore
 from pipeline.vlm.slots import TOLERANCES
-
-
-def quiet(line: str) -> None:
-    """What is said is not looked at."""
+from tests.store.samples import put
 
 
 @pytest.fixture(scope="module")
 def extracted(make_document, tmp_path_factory) -> dict[str, Any]:
     document = make_document(tmp_path_factory.mktemp("extracted"))
     document["vlm"]["variants"] = 2
-    extract(Params.model_validate(document), quiet)
+    extract(Params.model_validate(document), print)
     return document
 
 
@@ -43,17 +40,7 @@ def document(extracted, tmp_path) -> dict[str, Any]:
 
 def again(document: dict[str, Any], rows: int = 100, **verify: Any) -> Reextraction:
     params = Params.model_validate(document | {"verify": {"reextract": rows, **verify}})
-    return reextract(params.extract.store, params, quiet)
-
-
-def overwrite(document: dict[str, Any], array: str, row: int, change) -> None:
-    store = Path(document["extract"]["store"])
-    spec = read_spec(store, array)
-    path = chunk_paths(store, spec)[0]
-    content = bytearray(path.read_bytes())
-    values = np.frombuffer(memoryview(content)[:-4], spec.dtype).reshape(-1, *spec.shape[1:])
-    change(values[row])
-    path.write_bytes(content)
+    return reextract(params.extract.store, params, print)
 
 
 class TestSoundStore:
@@ -77,12 +64,11 @@ class TestSoundStore:
 
 class TestDeviations:
     def test_a_changed_variant_of_a_row_is_named(self, document):
-        slots = read_spec(Path(document["extract"]["store"]), "vl/features").shape[1]
-
-        def change(row):
-            row[slots - 1] *= 1.02
-
-        overwrite(document, "vl/features", 11, change)
+        store = Path(document["extract"]["store"])
+        features = FeatureStore.open(store).array("vl/features")[11]
+        slots = len(features)
+        features[slots - 1] *= 1.02
+        put(store, "vl/features", 11, features)
         found = again(document)
         (beyond,) = found.beyond
         assert (beyond.row, beyond.slot) == (11, slots - 1)
@@ -92,7 +78,7 @@ class TestDeviations:
         assert not again(document, tolerance=0.2).beyond
 
     def test_a_nan_is_beyond_every_tolerance(self, document):
-        overwrite(document, "vl/features", 3, lambda row: row.fill(np.nan))
+        put(Path(document["extract"]["store"]), "vl/features", 3, np.nan)
         found = again(document, tolerance=1e3)
         assert [one.row for one in found.beyond] == [3]
         assert found.deviations[0].row == 3

@@ -4,7 +4,6 @@ Where a test needs a process and not an interpreter, `fork` makes one of the `fo
 """
 
 import importlib
-import importlib.util
 import shutil
 from collections.abc import Callable
 from multiprocessing.connection import Connection
@@ -19,18 +18,11 @@ import yaml
 from pipeline.base.config import Params
 from pipeline.extract import extract
 from stages.command import run
+from tests.extract import conftest as extraction
 
-ROOT = Path(__file__).resolve().parents[2]
-
-_place = ROOT / "tests" / "extract" / "conftest.py"
-_spec = importlib.util.spec_from_file_location("extraction_conftest", _place)
-assert _spec is not None
-assert _spec.loader is not None
-_extraction = importlib.util.module_from_spec(_spec)
-_spec.loader.exec_module(_extraction)
-write_episode = _extraction.write_episode
-recorded_once = _extraction.recorded_once
-make_document = _extraction.make_document
+write_episode = extraction.write_episode
+recorded_once = extraction.recorded_once
+make_document = extraction.make_document
 
 PACE: dict[str, Any] = {
     "horizon": 3,
@@ -66,11 +58,7 @@ def document(
         "data": document["data"] | {"root": str(tmp_path / "recordings")},
         "extract": document["extract"] | {"store": str(tmp_path / "stores" / "made.zarr")},
         "train_head": tiny_head(tmp_path, **PACE),
-        "evaluate": {
-            "checkpoint": str(tmp_path / "head"),
-            "output": str(tmp_path / "report"),
-            "device": "cpu",
-        },
+        "evaluate": evaluated(tmp_path),
     }
 
 
@@ -92,6 +80,11 @@ def params(document: dict[str, Any], tmp_path: Path) -> Path:
     return write_params(document, tmp_path)
 
 
+def evaluated(folder: Path) -> dict[str, Any]:
+    """The section `evaluate` of the head that is trained in a folder."""
+    return {"checkpoint": str(folder / "head"), "output": str(folder / "report"), "device": "cpu"}
+
+
 def write_params(document: dict[str, Any], folder: Path) -> Path:
     path = folder / "params.yaml"
     path.write_text(yaml.safe_dump(document))
@@ -110,11 +103,7 @@ def head_params(tiny_head: TinyHead, tmp_path: Path) -> Callable[..., Path]:
             "vlm": {"checkpoint": "unused"},
             "extract": {"store": str(store)},
             "train_head": tiny_head(folder, **PACE),
-            "evaluate": {
-                "checkpoint": str(folder / "head"),
-                "output": str(folder / "report"),
-                "device": "cpu",
-            },
+            "evaluate": evaluated(folder),
         }
         for section, values in sections.items():
             document[section] = document.get(section, {}) | values

@@ -55,11 +55,6 @@ def plant(place: Path, foreign: str) -> None:
         os.utime(place, (0, 0))  # no living holder of a lock either
     elif foreign == "zarr group":
         zarr.create_array(place, name="data/action", shape=(3,), dtype="f4")
-    elif foreign == "dvclive":
-        (place / "plots" / "metrics").mkdir(parents=True)
-        for name in ("metrics.json", "plots/metrics/loss.tsv", "plots/custom/roc.json"):
-            (place / name).parent.mkdir(exist_ok=True)
-            (place / name).write_text("{}")
     else:
         (place / "chapters").mkdir(parents=True)
         (place / "chapters" / "thesis.txt").write_text("years of work")
@@ -68,13 +63,9 @@ def plant(place: Path, foreign: str) -> None:
 @pytest.mark.parametrize(
     ("writer", "foreign"),
     [
-        *(
-            pytest.param(writer, kind, marks=[pytest.mark.slow] * (turn % 3 != at))
-            for turn, writer in enumerate(WRITERS)
-            for at, kind in enumerate(("folder", "file", "zarr group"))
-        ),
-        ("head logs", "dvclive"),
-        ("tuned logs", "dvclive"),
+        pytest.param(writer, kind, marks=[pytest.mark.slow] * (turn % 3 != at))
+        for turn, writer in enumerate(WRITERS)
+        for at, kind in enumerate(("folder", "file", "zarr group"))
     ],
 )
 def test_is_left_as_it_is(writer, foreign, params, here, tmp_path):

@@ -19,10 +19,6 @@ from tests.fuzz import oracle
 from tests.fuzz.corpus import ARCHIVE, HEAD, RECORDINGS, STORE, params
 from tests.fuzz.mutations import Change, change_any
 
-ROOT = Path(__file__).parents[2]
-_PARTS = {"read": "extract", "load": "evaluate"}
-"""The parts of commands that read, which take a tenth of the time, and their commands."""
-
 
 @dataclass(frozen=True)
 class Subject:
@@ -33,7 +29,7 @@ class Subject:
     place: str
     """Where it lies in a case's folder, as in the corpus."""
     stage: str = "extract"
-    """What reads it."""
+    """What reads it: a command; or, in a tenth of the time, the part of one that reads."""
     sets: dict[str, str] = field(default_factory=dict)
     """What its command is told, where {} is its place, and {corpus} that of the corpus."""
 
@@ -113,11 +109,6 @@ class Case:
         words = {k: v.format(self.place, corpus=self.corpus) for k, v in self.subject.sets.items()}
         options = [word for key in words for word in ("--set", f"{key}={words[key]}")]
         return ["--params", str(self.folder / "params.yaml"), *options]
-
-    @property
-    def command(self) -> list[str]:
-        """As a user types it."""
-        return ["python", "-m", f"stages.{_PARTS.get(self.stage, self.stage)}", *self.arguments]
 
     def make(self) -> Change:
         """Lay the thing out as it is in the corpus, linked, and do to it what the number says."""

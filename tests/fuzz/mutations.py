@@ -90,16 +90,12 @@ def _encoded(text: str) -> bytes:
     return text.encode("utf-8", "surrogatepass")
 
 
-def _key(rng: Random, node: Any) -> Any:
-    return rng.choice(list(node) if isinstance(node, dict) else range(len(node)))
-
-
 def _place(rng: Random, document: Any) -> tuple[Any, Any, str]:
     """A random container in a document, a key of it, and the place in words."""
     parent, key, names = None, None, list[str]()
     node = document
     while isinstance(node, dict | list) and node and (parent is None or rng.random() < 0.75):
-        key = _key(rng, node)
+        key = rng.choice(list(node) if isinstance(node, dict) else range(len(node)))
         parent, node = node, node[key]
         names.append(str(key))
     return parent, key, ".".join(names)[:200]
@@ -178,7 +174,7 @@ FILES: dict[str, Callable[[Path], object]] = {
 
 
 def change_file(rng: Random, path: Path, others: list[Path]) -> Change:
-    """Something else in the place of a file: nothing, a pipe, another's file, a strange name."""
+    """Something else in the place of a file: nothing, a pipe, another's file."""
     name = rng.choice([*FILES, "of another"])
     if name == "of another" and others:
         other = rng.choice(others)

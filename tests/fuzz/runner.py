@@ -63,13 +63,11 @@ class Verdict:
 
     def __str__(self) -> str:
         change: Change = self.told["made"]
-        path = os.path.relpath(os.fsencode(change.path), os.fsencode(self.case.folder))
         text = self.stderr.strip().replace("\n", "\n  ")
-        text = text if len(text) < 1500 else f"{text[:900]} … {text[-500:]}"
         return (
             f"case {self.case.number} ({self.case.kind}): {self.outcome}: {self.why}\n"
-            f"  {path.decode('utf-8', 'backslashreplace')}: {change.what}\n"
-            f"  {' '.join(self.case.command)}\n  {text}\n"
+            f"  {os.path.relpath(change.path, self.case.folder)}: {change.what}\n"
+            f"  {self.case.stage} {' '.join(self.case.arguments)}\n  {text}\n"
             f"  again: python -m tests.fuzz.table --seed {self.case.seed} --case {self.case.number}"
         )
 

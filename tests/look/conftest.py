@@ -145,23 +145,19 @@ def assert_page_is_sound(browser_page: Visitor) -> Callable[[Path], None]:
             visit = browser_page(path, size, schemes[0])
             for scheme in schemes:
                 visit.page.emulate_media(color_scheme=scheme)
-                assert_is_sound(visit, scheme, f"{path.name} at {size}, {scheme}")
+                found, here = visit.page.evaluate(LOOK), f"{path.name} at {size}, {scheme}"
+                assert visit.trouble == [], here
+                assert found["overflow"] <= 0, here
+                assert found["links"] > 0, here
+                for wrong in ("cut", "unseen", "unnamed", "faint", "dead", "twice"):
+                    assert found[wrong] == [], f"{here}: {wrong}"
+                paper, inks = found["paper"], found["inks"]
+                if scheme == "light":
+                    assert paper > 0.9 and all(ink < 0.1 for ink in inks), (here, found)
+                else:
+                    assert paper < 0.05 and all(ink > 0.5 for ink in inks), (here, found)
 
     return check
-
-
-def assert_is_sound(visit: Visit, scheme: str, here: str) -> None:
-    found = visit.page.evaluate(LOOK)
-    assert visit.trouble == [], here
-    assert found["overflow"] <= 0, here
-    assert found["links"] > 0, here
-    for wrong in ("cut", "unseen", "unnamed", "faint", "dead", "twice"):
-        assert found[wrong] == [], f"{here}: {wrong}"
-    inks = found["inks"]
-    if scheme == "light":
-        assert found["paper"] > 0.9 and all(ink < 0.1 for ink in inks), (here, found)
-    else:
-        assert found["paper"] < 0.05 and all(ink > 0.5 for ink in inks), (here, found)
 
 
 def drawn() -> Figure:

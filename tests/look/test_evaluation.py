@@ -20,7 +20,6 @@ from pipeline.look.evaluation import evaluation_report
 from pipeline.look.page.blocks import Outline, Report, Section
 from pipeline.look.page.writing import PAGE, write_report
 from pipeline.policy.checkpoint import PolicyCheckpoint
-from pipeline.policy.normalization import ChannelStatistics, Normalization
 from pipeline.policy.policy import Policy
 from pipeline.policy.shape import Anchor
 from pipeline.store import FeatureStore, episode_name
@@ -29,43 +28,28 @@ from pipeline.train.predictions import predict
 from pipeline.train.run import policy_shape
 from pipeline.train.scores import action_space, compare
 from pipeline.train.split import Split
+from pipeline.train.statistics import fit_normalization
 from pipeline.train.training_data import source_of, split_parts
-
-PARAMS = TrainHeadParams.model_validate(
-    {
-        "sensor_encoder": {"channels": [8], "layers": 0, "heads": 1, "output_dim": 8},
-        "state_encoder": {"dim": 8, "layers": 0, "heads": 1, "output_dim": 8},
-        "expert": {"dim": 8, "layers": 1, "heads": 1},
-        "horizon": 4,
-        "sensor_window": 6,
-        "state_window": 5,
-    }
-)
 
 
 @pytest.fixture(scope="module")
 def judgement(
-    tiny_store: Callable[..., Path], tmp_path_factory: pytest.TempPathFactory
+    tiny_store: Callable[..., Path],
+    tiny_head: Callable[..., dict[str, Any]],
+    tmp_path_factory: pytest.TempPathFactory,
 ) -> Evaluation:
     """An untrained policy on three held-out episodes whose recordings are nowhere."""
-    store = FeatureStore.open(tiny_store(tmp_path_factory.mktemp("judged"), sensor_channels=40))
-
-    def statistics(name: str) -> ChannelStatistics:
-        values = store.array(name).astype(np.float64)
-        return ChannelStatistics(values.mean(0), values.std(0), len(values))
-
-    normalization = Normalization(
-        statistics("tick/action"),
-        statistics("vl/features"),
-        statistics("sensor/values"),
-        statistics("state/values"),
-    )
+    folder = tmp_path_factory.mktemp("judged")
+    store = FeatureStore.open(tiny_store(folder, sensor_channels=40))
+    params = TrainHeadParams.model_validate(tiny_head(folder, horizon=4))
+    windows = Windows.of(params)
+    normalization = fit_normalization(store, np.arange(store.ticks), windows)
     shape = policy_shape(store, normalization)
-    policy = Policy(PARAMS, shape, normalization).eval()
+    policy = Policy(params, shape, normalization).eval()
     ticks = np.arange(90, 180)
     names = {episode_name(episode): episode_name(episode) for episode in store.episodes}
     checkpoint = PolicyCheckpoint(
-        params=PARAMS,
+        params=params,
         shape=shape,
         normalization=normalization,
         source=source_of(store),
@@ -73,7 +57,6 @@ def judgement(
         step=20,
         weights=policy.state_dict(),
     )
-    windows = Windows.of(PARAMS)
     baselines = Baselines(store, np.arange(90), 4, normalization.features)
     predictions = predict(policy, store, ticks, windows, 64)
     space, phases = action_space(store, normalization), np.where(ticks % 2, "approach", "hold")
@@ -92,7 +75,7 @@ def judgement(
 
 def test_trainings_that_differ_in_seed_or_fold_have_one_recipe(judgement: Evaluation) -> None:
     def recipe(**changed: Any) -> str:
-        document = PARAMS.model_dump() | changed
+        document = judgement.checkpoint.params.model_dump() | changed
         params = TrainHeadParams.model_validate(document)
         checkpoint = replace(judgement.checkpoint, params=params)
         policy = judgement.checkpoint.policy()

@@ -1,11 +1,9 @@
 """Pictures are written for any shape of data, whole, and the same for the same numbers."""
 
 from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
-from matplotlib.figure import Figure
 
 from pipeline.evaluate.baselines import BASELINES
 from pipeline.look import evaluation as plots
@@ -50,26 +48,19 @@ def evaluated(
     return compare(predictions, rules, (names, units, groups, spread)), predictions, store
 
 
-def pictures(comparison: Comparison, predictions: Predictions, store: Any) -> dict[str, Any]:
-    """Each picture of an evaluation by its file's name."""
-    instants = predictions.ticks[predictions.episodes == comparison.episodes[0]][[0, 6]]
-
-    def chunks() -> Figure:
-        return plots.draw_chunks(comparison, predictions, store, store.episodes[0], instants)
-
-    return {
-        "horizon.png": lambda: plots.draw_horizon(comparison, store.action_hz),
-        "methods.png": lambda: plots.draw_methods(comparison),
-        "chunks.png": chunks,
-    }
-
-
 @pytest.mark.parametrize(
     ("episodes", "dimensions", "constant", "horizon"), [(2, 6, 1, 8), (1, 1, 0, 1)]
 )
 def test_every_picture_is_written(tmp_path, episodes, dimensions, constant, horizon):
     shown = evaluated(episodes, dimensions, constant=constant, horizon=horizon)
-    files = write(tmp_path, pictures(*shown))
+    comparison, predictions, store = shown
+    instants = predictions.ticks[predictions.episodes == comparison.episodes[0]][[0, 6]]
+    pictures = {
+        "horizon.png": lambda: plots.draw_horizon(comparison, store.action_hz),
+        "methods.png": lambda: plots.draw_methods(comparison),
+        "chunks.png": lambda: plots.draw_chunks(*shown, store.episodes[0], instants),
+    }
+    files = write(tmp_path, pictures)
     assert len(files) == 3 and all(file.stat().st_size > 5000 for file in files)
 
 

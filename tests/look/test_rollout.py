@@ -11,9 +11,7 @@ from pipeline.base.text import Table
 from pipeline.evaluate.rollouts import InsertionTrace, RolloutEpisode, Rollouts
 from pipeline.look.page.blocks import Outline, Picture, Report
 from pipeline.look.page.writing import PAGE, write_report
-from pipeline.look.rollout import (
-    rollout_report,
-)
+from pipeline.look.rollout import rollout_report
 
 ALWAYS = {"courses", "filmstrip_worst"}
 

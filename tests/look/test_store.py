@@ -9,16 +9,11 @@ import numpy as np
 import pytest
 
 from pipeline.base.config import InspectParams
-from pipeline.base.errors import StoreIncomplete, StoreMismatch
+from pipeline.base.errors import StoreIncomplete
 from pipeline.look.page.blocks import Issues, Outline, Report
 from pipeline.look.page.writing import write_report
-from pipeline.look.store import (
-    StoreView,
-    inspect_store,
-    store_report,
-)
+from pipeline.look.store import StoreView, inspect_store, store_report
 from pipeline.store import FeatureStore
-from pipeline.store.chunks import write_seal
 
 ROWS = 10
 """VL rows of each of the six episodes of a tiny store."""
@@ -47,13 +42,6 @@ def damage(path: Path, name: str, change: Callable[[np.ndarray], Any]) -> None:
     change(np.memmap(file, like.dtype, "r+", shape=like.shape))
 
 
-def attributes(path: Path, change: Callable[[dict[str, Any]], Any]) -> None:
-    document = json.loads((path / "zarr.json").read_text())
-    change(document["attributes"])
-    (path / "zarr.json").write_text(json.dumps(document))
-    write_seal(path)
-
-
 def look(path: Path, **params: Any) -> StoreView:
     return inspect_store(path, InspectParams(**params))
 
@@ -80,19 +68,6 @@ class TestFacts:
         assert first.episode.id == "episode_000" and first.seconds == pytest.approx(2.9)
         assert first.covered == {"sensor": 1.0, "state": 1.0, "View1": 0.5}
         assert second.covered["View1"] == 1
-
-    def test_what_is_no_finished_store_says_what_to_run(self, path, tmp_path):
-        with pytest.raises(StoreIncomplete, match=r"stages\.extract"):
-            look(tmp_path / "none.zarr")
-        part = path.rename(path.with_name("tiny.zarr.part"))
-        with pytest.raises(
-            StoreIncomplete, match=r"unfinished build.*stages\.extract.*tiny\.zarr\.$"
-        ):
-            look(part)
-        archive = part.rename(path.with_name("tiny.archive.zarr"))
-        attributes(archive, lambda attrs: attrs.update(archive={}))
-        with pytest.raises(StoreMismatch, match=r"stages\.archive --restore"):
-            look(archive)
 
 
 class TestIntegrity:

@@ -1,11 +1,9 @@
 """A checkpoint comes back whole, or says what is wrong with it."""
 
 import json
-from collections.abc import Callable
 from dataclasses import replace
 from functools import reduce
 from operator import getitem
-from typing import Any
 
 import numpy as np
 import pytest
@@ -13,12 +11,7 @@ import torch
 
 from pipeline.base.config import TrainHeadParams
 from pipeline.base.errors import CheckpointIncomplete, CheckpointMismatch
-from pipeline.base.files import (
-    read_document,
-    read_tensors,
-    write_tensors,
-    write_with_digest,
-)
+from pipeline.base.files import read_document, read_tensors, write_tensors, write_with_digest
 from pipeline.base.provenance import SplitPart
 from pipeline.policy.checkpoint import (
     PolicyCheckpoint,
@@ -36,18 +29,7 @@ from pipeline.train.statistics import fit_normalization
 from pipeline.train.training_data import source_of
 
 WINDOWS = Windows(8, 65, 100, 0.1, 1.0)
-PARAMS = TrainHeadParams.model_validate(
-    {
-        "sensor_encoder": {"channels": [8], "layers": 0, "heads": 1, "output_dim": 8},
-        "state_encoder": {"dim": 8, "layers": 0, "heads": 1, "output_dim": 8},
-        "expert": {"dim": 8, "layers": 1, "heads": 1},
-        "horizon": 3,
-        "sensor_window": 6,
-        "state_window": 5,
-        "group_weights": {"rotation": 2.0},
-        "store": "some/where.zarr",
-    }
-)
+CHOSEN = {"horizon": 3, "group_weights": {"rotation": 2.0}, "store": "some/where.zarr"}
 
 
 @pytest.fixture(scope="module")
@@ -60,12 +42,13 @@ def part(first: int, stop: int, content: str, group: str) -> SplitPart:
 
 
 @pytest.fixture
-def checkpoint(store):
+def checkpoint(store, tiny_head, tmp_path):
+    params = TrainHeadParams.model_validate(tiny_head(tmp_path, **CHOSEN))
     normalization = fit_normalization(store, torch.arange(60).numpy(), WINDOWS)
     shape = policy_shape(store, normalization)
     torch.manual_seed(3)
     return PolicyCheckpoint(
-        params=PARAMS,
+        params=params,
         shape=shape,
         normalization=normalization,
         source=source_of(store),
@@ -75,7 +58,7 @@ def checkpoint(store):
             "test": {"left/episode_004": part(0, 30, "0-4", "elsewhere")},
         },
         step=7,
-        weights=Policy(PARAMS, shape, normalization).state_dict(),
+        weights=Policy(params, shape, normalization).state_dict(),
         metrics={"val/error": 1 / 3},
     )
 
@@ -83,7 +66,7 @@ def checkpoint(store):
 def test_a_checkpoint_comes_back_to_the_bit(checkpoint, store, tmp_path):
     save_policy(tmp_path / "best", checkpoint)
     found = load_policy(tmp_path / "best")
-    assert found.params == PARAMS
+    assert found.params == checkpoint.params
     assert found.shape == checkpoint.shape
     assert found.source == checkpoint.source
     assert found.split == checkpoint.split
@@ -107,7 +90,6 @@ def test_its_description_is_what_serving_needs(checkpoint, tmp_path):
     left = {"ticks": [0, 30], "content": "0-4", "group": "elsewhere"}
     assert document["split"]["test"] == {"left/episode_004": left}
     assert document["normalization"]["action"]["count"] == 60
-    assert "golden" not in document
     document["split"]["test"]["left/episode_004"]["ticks"] = [20, 30]
     path.write_text(json.dumps(document))
     with pytest.raises(CheckpointIncomplete, match=r"policy\.json: it was altered"):
@@ -122,7 +104,7 @@ def test_keys_of_other_versions_are_left_out(checkpoint, tmp_path):
     head |= {"sensor_lr": 1e-3, "loggers": ["report"], "regression": {"refinements": 1}}
     head["diffusion"]["schedule"] = "cosine"
     write_with_digest(path, document)
-    assert load_policy(tmp_path / "best").params == PARAMS
+    assert load_policy(tmp_path / "best").params == checkpoint.params
 
 
 def test_a_folder_or_a_run_is_found(checkpoint, tmp_path):
@@ -165,23 +147,18 @@ def test_a_description_that_is_none_is_named(checkpoint, tmp_path, place, value,
     assert "Copy it again, name another, or remove its folder and run the training" in message
 
 
-def _first(weights: dict[str, Any], change: Callable[[Any], Any]) -> dict[str, Any]:
-    name = next(name for name, value in weights.items() if value.ndim == 2)
-    return {**weights, name: change(weights[name])}
-
-
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        (lambda w: _first(w, lambda v: v.half()), r'"torch.float16", .* -> \["torch.float32"'),
-        (lambda w: _first(w, lambda v: v * torch.nan), "expected finite numbers, found NaN"),
-        (lambda w: {**w, "extra": torch.zeros(3)}, r'extra: \["torch.float32", \[3\]\] -> null'),
-        (lambda w: dict(list(w.items())[1:]), r"null -> \[\"torch.float32"),
+        (lambda values: values.half(), r'"torch.float16", .* -> \["torch.float32"'),
+        (lambda values: values * torch.nan, "expected finite numbers, found NaN"),
     ],
-    ids=["float16", "nan", "extra", "missing"],
+    ids=["float16", "nan"],
 )
 def test_weights_of_another_policy_are_refused(checkpoint, tmp_path, change, said):
-    save_policy(tmp_path / "best", replace(checkpoint, weights=change(checkpoint.weights)))
+    name = next(name for name, value in checkpoint.weights.items() if value.ndim == 2)
+    weights = {**checkpoint.weights, name: change(checkpoint.weights[name])}
+    save_policy(tmp_path / "best", replace(checkpoint, weights=weights))
     with pytest.raises((CheckpointIncomplete, CheckpointMismatch), match=said) as caught:
         load_policy(tmp_path / "best")
     assert str(tmp_path / "best/policy.safetensors") in str(caught.value)
@@ -206,15 +183,12 @@ class TestGoldenRows:
             assert np.array_equal(before.frames["View1"], after.frames["View1"])
             assert after.frames["View1"].dtype == np.uint8
 
-    @pytest.mark.parametrize("harm", ["altered", "gone"])
-    def test_damage_is_named(self, golden, tmp_path, harm):
+    def test_damage_is_named(self, golden, tmp_path):
         save_policy(tmp_path / "best", golden)
         path = tmp_path / "best/golden.safetensors"
         content = bytearray(path.read_bytes())
         content[-1] ^= 1
-        path.unlink()
-        if harm == "altered":
-            path.write_bytes(content)
+        path.write_bytes(content)
         for read in (load_policy, check_policy):
             with pytest.raises(CheckpointIncomplete, match=r"golden\.safetensors: .*Copy it again"):
                 read(tmp_path / "best")

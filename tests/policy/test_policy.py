@@ -1,5 +1,4 @@
 from dataclasses import replace
-from typing import Any
 
 import pytest
 import torch
@@ -74,9 +73,15 @@ class TestEveryKind:
 
     def test_padding_and_invalid_slots_change_nothing(self, any_policy, observe):
         seen = observe()
-        blank_some(seen)
+        seen.sensor_valid = torch.tensor([0, 3, 8, 13])
+        seen.state_valid = torch.tensor([0, 3, 8, 25])
+        seen.slot_valid[1] = False
+        seen.slot_valid[2, 3] = False
         before = any_policy.act(seen, seeded())
-        fill_what_is_blank(seen, float("nan"))
+        seen.features[~seen.slot_valid] = torch.nan
+        for row in range(4):
+            seen.sensor[row, : 13 - int(seen.sensor_valid[row])] = torch.nan
+            seen.state[row, : 25 - int(seen.state_valid[row])] = torch.nan
         assert torch.equal(any_policy.act(seen, seeded()), before)
 
     def test_gradient_reaches_every_weight_and_every_missing_embedding(self, any_policy, observe):
@@ -104,9 +109,9 @@ class TestGuide:
         return build_policy(model_type=request.param).eval()
 
     @staticmethod
-    def continuing(policy: Policy, weight: float = 1.0) -> Guide:
+    def continuing(policy: Policy) -> Guide:
         chunk = policy.action_normalizer.invert(torch.full((4, 8, 7), 0.5))
-        return Guide(chunk, torch.full((4, 8), weight))
+        return Guide(chunk, torch.ones(4, 8))
 
     def test_the_expert_is_given_it_normalised_for_every_sample(self, policy, observe, monkeypatch):
         given = []
@@ -127,21 +132,6 @@ class TestGuide:
             made = replace(seen, features=seen.features + 0)
             same = Guide(guide.chunk + 0, guide.weight + 0)
             assert torch.equal(policy.act(made, seeded(), same), expected)
-
-
-def blank_some(seen: Any) -> None:
-    """Leave out readings and slots, in the first sample but one every one."""
-    seen.sensor_valid = torch.tensor([0, 3, 8, 13])
-    seen.state_valid = torch.tensor([0, 3, 8, 25])
-    seen.slot_valid[1] = False
-    seen.slot_valid[2, 3] = False
-
-
-def fill_what_is_blank(seen: Any, value: float) -> None:
-    seen.features[~seen.slot_valid] = value
-    for row in range(4):
-        seen.sensor[row, : 13 - int(seen.sensor_valid[row])] = value
-        seen.state[row, : 25 - int(seen.state_valid[row])] = value
 
 
 def test_loss_normalises_the_target_and_act_inverts(build_policy, observe, normalization):

@@ -23,16 +23,9 @@ ENCODERS: dict[str, Callable[[], nn.Module]] = {
     "state": lambda: RobotStateEncoder(CHANNELS, WINDOW, 16, 1, 2, OUTPUT, patch=4),
 }
 
-SENSOR_ENCODERS = [name for name in ENCODERS if "sensor" in name]
-
 
 @pytest.fixture(params=ENCODERS)
 def encoder(request):
-    return ENCODERS[request.param]()
-
-
-@pytest.fixture(params=SENSOR_ENCODERS)
-def sensor_encoder(request):
     return ENCODERS[request.param]()
 
 
@@ -46,9 +39,6 @@ def windows(batch: int = 14) -> Tensor:
 
 
 class TestWindowEncoderContract:
-    def test_shape(self, encoder):
-        assert encoder(windows(3), torch.tensor([0, 5, 13])).shape == (3, OUTPUT)
-
     def test_padding_never_reaches_the_output(self, encoder):
         values, valid = windows(), torch.arange(14)
         changed = values.clone()
@@ -100,10 +90,6 @@ class TestWindowEncoderContract:
         torch.testing.assert_close(rough.float(), exact, atol=0.05, rtol=0.05)
         assert all(torch.isfinite(p.grad).all() for p in encoder.parameters() if p.grad is not None)
 
-    def test_time_order_matters(self, encoder):
-        values = windows(2)
-        assert (encoder(values) - encoder(values.flip(1))).abs().max() > 1e-3
-
 
 @pytest.mark.parametrize("real", [1, 8])
 def test_a_halving_block_sees_padding_as_the_end_of_the_signal(real):
@@ -123,8 +109,7 @@ def test_sensor_encoder_takes_any_window_and_channel_count():
 
 
 @pytest.mark.parametrize("length", [5, 130])
-def test_sensor_windows_of_another_length_are_resampled_without_leaks(length, sensor_encoder):
-    encoder = sensor_encoder
+def test_windows_of_another_length_are_resampled_without_leaks(length, encoder):
     values, valid = torch.randn(3, length, CHANNELS), torch.tensor([0, length // 2, length])
     changed = values.clone()
     changed[0] = float("nan")

@@ -14,6 +14,7 @@ import torch
 
 from pipeline.base.config import Params, ServeParams, TrainHeadParams, load_params
 from pipeline.compat.unified import no_normalization
+from pipeline.data.insertion import SENSOR, STATE
 from pipeline.policy.checkpoint import PolicyCheckpoint, find_policy, load_policy
 from pipeline.policy.observation import PolicyShape
 from pipeline.policy.policy import Policy
@@ -34,8 +35,8 @@ SOURCE = {
             "units": ["mm"] * 3 + ["deg"] * 3 + [""],
             "kind": "delta",
         },
-        "state": {"names": [f"joint_{i}" for i in range(12)], "units": ["deg"] * 12},
-        "sensor": {"names": [f"sensor_{i}" for i in range(1026)], "units": [""] * 1026},
+        "state": {"names": list(STATE.names), "units": list(STATE.units)},
+        "sensor": {"names": list(SENSOR.names), "units": list(SENSOR.units)},
         "views": list(VIEWS),
     },
     "action_hz": 10.0,
@@ -98,6 +99,30 @@ def build_policy(
     told = (INSTRUCTION,)
     checkpoint = PolicyCheckpoint(params, shape, normal, SOURCE, **held, instructions=told)
     return checkpoint, policy, Glance()
+
+
+def watch(monkeypatch: pytest.MonkeyPatch, policy: Policy) -> list[dict[str, np.ndarray]]:
+    """What the policy is given in each pass, by field (robot, …); it grows with every pass."""
+    given, observe = list[dict[str, np.ndarray]](), policy.observe
+
+    def watched(streams: Any) -> Any:
+        given.append({name: np.array(value) for name, value in streams.items()})
+        return observe(streams)
+
+    monkeypatch.setattr(policy, "observe", watched)
+    return given
+
+
+class Blocked:
+    """Keeps the model of a served policy waiting, once it has begun to look, until `go`."""
+
+    def __init__(self, served: Any) -> None:
+        self.looking, self.go = threading.Event(), threading.Event()
+        served.glance.before = self
+
+    def __call__(self) -> None:
+        self.looking.set()
+        assert self.go.wait(60)
 
 
 class SimulatedTime:

@@ -5,7 +5,6 @@ import re
 import socket
 import subprocess
 import sys
-import threading
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +13,7 @@ import pytest
 
 from pipeline.base.errors import CheckpointMismatch, ObservationError, ServerError
 from pipeline.robot.client import PolicyClient, refuse_other_robot
+from tests.robot.conftest import Blocked
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -82,13 +82,12 @@ def test_nobody_listens_or_something_else_does() -> None:
 
 def test_a_late_answer_is_never_taken_for_the_next(served_policy, serving, observe) -> None:
     served = served_policy()
-    go = threading.Event()
-    served.glance.before = lambda: go.wait(60)
+    blocked = Blocked(served)
     with PolicyClient(f"ws://{serving(served).address}", timeout_s=60) as client:
         client._timeout_s = 0.1  # of this answer alone, which does not come
         with pytest.raises(ServerError, match=r"expected an answer within 0\.1 s"):
             client.infer(observe(0))
-        go.set()
+        blocked.go.set()
         with pytest.raises(ServerError, match="the connection is closed"):
             client.infer(observe(7))
 

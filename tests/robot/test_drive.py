@@ -17,7 +17,6 @@ from pipeline.data import open_recordings
 from pipeline.robot.drive import drive, make_robot
 from pipeline.robot.lerobot_arm import LeRobotArm
 
-CHANNELS = ("dx", "dy", "dz", "rx", "ry", "rz", "gripper")
 LEROBOT = """
     import numpy as np
     from lerobot.robots import RobotConfig
@@ -100,12 +99,7 @@ def lerobot(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
 
 
 @pytest.fixture
-def driven(
-    served_policy: Callable[..., Any],
-    simulated_time: Any,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> Callable[..., Any]:
+def driven(served_policy, simulated_time, tmp_path, monkeypatch) -> Callable[..., Any]:
     """`driven(limits, key=value, ...)`: drives the fake arm; its report and what was said."""
     served = served_policy()
     monkeypatch.setattr("pipeline.robot.session.ServedPolicy.load", lambda *_: served)
@@ -114,7 +108,7 @@ def driven(
     streams = served.metadata["streams"]
     config = {
         "joints": list(streams["state"]["names"]),
-        "motors": [f"{name}.pos" for name in CHANNELS],
+        "motors": [f"{name}.pos" for name in streams["action"]["names"]],
         "views": list(streams["views"]),
     }
 

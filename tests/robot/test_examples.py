@@ -6,7 +6,6 @@ from pathlib import Path
 import pytest
 
 from pipeline.base.errors import CheckpointMismatch
-from pipeline.data.insertion import SENSOR, STATE
 from pipeline.simulation.insertion import MAX_TICKS
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -22,17 +21,13 @@ def test_an_example_is_short(example: Path) -> None:
 def test_the_simulated_arm_runs_over_the_wire_and_refuses_a_policy_for_another_robot(
     served_policy, serving, capsys
 ):
-    served = served_policy()
-    phantom = {"state": STATE, "sensor": SENSOR}
-    served.metadata["streams"] = served.metadata["streams"] | {
-        name: {"names": list(own.names), "units": list(own.units)} for name, own in phantom.items()
-    }
-    server = serving(served)
+    server = serving(served_policy())
     main = runpy.run_path(str(ROOT / "examples" / "simulated_arm.py"))["main"]
     main(f"ws://{server.address}", 78)
     lines = capsys.readouterr().out.splitlines()
     assert 20 < len(lines) <= MAX_TICKS and "features 0." in lines[0]
     assert lines[-1] != "inserted"  # a policy of random weights
-    other = serving(served_policy())  # whose channels have other names
-    with pytest.raises(CheckpointMismatch, match=r'state: \["joint_0"'):
-        main(f"ws://{other.address}", 78)
+    other = served_policy()
+    other.metadata |= {"action_hz": 30.0}
+    with pytest.raises(CheckpointMismatch, match="action_hz: 30"):
+        main(f"ws://{serving(other).address}", 78)

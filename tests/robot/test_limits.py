@@ -9,20 +9,13 @@ import pytest
 
 from pipeline.base.config import LimitsFile
 from pipeline.base.errors import ConfigError
-from pipeline.data.insertion import SENSOR, STATE
+from pipeline.data.insertion import SENSOR
 from pipeline.robot.limits import Limits
 from pipeline.robot.loop import SafeStop, StopKind
 from pipeline.simulation.insertion import NeedleInsertion
+from tests.robot.conftest import SOURCE
 
-ACTION = ["dx", "dy", "dz", "rx", "ry", "rz", "gripper"]
-PHANTOM: dict[str, Any] = {
-    "streams": {
-        "action": {"names": ACTION, "units": ["mm"] * 3 + ["deg"] * 3 + [""], "kind": "delta"},
-        "state": {"names": list(STATE.names), "units": list(STATE.units)},
-        "sensor": {"names": list(SENSOR.names), "units": list(SENSOR.units)},
-    },
-    "moving": [True] * 6 + [False],
-}
+PHANTOM = {"streams": SOURCE["streams"], "moving": [True] * 6 + [False]}
 JOINTS: dict[str, Any] = {
     "streams": {
         "action": {"names": ["a", "b"], "units": ["deg", "deg"], "kind": "absolute"},
@@ -165,7 +158,6 @@ def test_demonstrations_keep_to_the_example() -> None:
         ("sped: {most: {dx: 1}}", "sped: unknown key"),
         ("speed: {most: {dq: 1}}", "speed.most.dq: the action has no such channel; it has trans"),
         ("force: {most: {torque: 1}}", "force.most.torque: the sensor has no such channel; it has"),
-        ("workspace: {box: {dx: [0, 1]}}", "workspace.box.dx: the state has no such channel"),
         ("workspace: {box: {pose_x: [2, 1]}}", "workspace.box.pose_x: expected the lowest and"),
         ("speed: {most: {gripper: 1}}", "gripper says where to be, and the state has no channel"),
     ],

@@ -26,7 +26,12 @@ from stages import extract, train_head
 Frames = Mapping[str, np.ndarray]
 
 
-def test_live_features_are_the_stored_ones(params: Params) -> None:
+@pytest.fixture
+def live(params: Params, checkpoint: PolicyCheckpoint) -> LiveFeatures:
+    return LiveFeatures(params.vlm, checkpoint.source["feature_spec"], "cpu", None)
+
+
+def test_live_features_are_the_stored_ones(params, live) -> None:
     store = FeatureStore.open(params.extract.store)
     recording, _ = open_recordings(params.data.sources, params.data.root).recordings
     cameras, times = recording.cameras(), store.array("vl/frame_time")
@@ -36,7 +41,6 @@ def test_live_features_are_the_stored_ones(params: Params) -> None:
         shown = np.searchsorted(camera.time, times[rows, place])
         for views, image in zip(frames, camera.read(shown.tolist()), strict=True):
             views[view] = image
-    live = LiveFeatures(params.vlm, store.spec, "cpu", None)
     features, valid = live(frames, recording.instruction)
     np.testing.assert_allclose(features, store.array("vl/features")[rows], atol=2e-5)
     assert valid.all()
@@ -56,16 +60,9 @@ def test_another_model_is_refused_before_a_weight_is_loaded(params, tmp_path, mo
         LiveFeatures(vlm, trained, "cpu", None)
 
 
-def test_the_key_of_frames_is_that_of_the_policys_store(params: Params) -> None:
-    store = FeatureStore.open(params.extract.store)
-    live = LiveFeatures(params.vlm, store.spec, "cpu", None)
-    for row in store.golden:
+def test_the_key_of_frames_is_that_of_the_policys_store(params, live) -> None:
+    for row in FeatureStore.open(params.extract.store).golden:
         assert live.key(row.frames, row.instruction) == row.key
-
-
-@pytest.fixture
-def live(params: Params, checkpoint: PolicyCheckpoint) -> LiveFeatures:
-    return LiveFeatures(params.vlm, checkpoint.source["feature_spec"], "cpu", None)
 
 
 def refusal(checkpoint: PolicyCheckpoint, live: LiveFeatures) -> str:
@@ -122,20 +119,14 @@ class TestRefused:
                 weights.mul_(1.05)
         said = refusal(checkpoint, live)
         assert "4 of 4 golden rows are not the features that the policy was trained on" in said
-        assert "slots deviate by more than 1e-03 of their size" in said
         assert "layer 3 mean " in said or "layer 3 grid View" in said
-        assert "and 43 more" in said and "The feature specs agree" in said
+        assert "and 43 more" in said
 
-    @pytest.mark.parametrize(
-        "change",
-        [
-            lambda frames: {v: f[..., ::-1] for v, f in frames.items()},
-            lambda frames: {v: f[::2, ::2].repeat(2, 0).repeat(2, 1) for v, f in frames.items()},
-        ],
-        ids=["red and blue exchanged", "another resize"],
-    )
-    def test_other_frames_on_the_way_to_the_model(self, checkpoint, live, monkeypatch, change):
-        broken(monkeypatch, change)
+    def test_frames_resized_otherwise_on_the_way_to_the_model(self, checkpoint, live, monkeypatch):
+        def blurred(frames: Frames) -> Frames:
+            return {v: f[::2, ::2].repeat(2, 0).repeat(2, 1) for v, f in frames.items()}
+
+        broken(monkeypatch, blurred)
         said = refusal(checkpoint, live)
         assert "golden rows are not" in said and " View" in said
 
@@ -175,7 +166,6 @@ def test_a_checkpoint_carries_the_basis_on_which_live_features_are_projected(
     assert "16 main directions of 128 numbers; the checkpoint carries" in capsys.readouterr().out
     folder = tmp_path / "head" / "best"
     checkpoint = load_policy(folder)
-    assert checkpoint.basis is not None
     live = LiveFeatures(params.vlm, checkpoint.source["feature_spec"], "cpu", checkpoint.basis)
     said: list[str] = []
     prove(checkpoint, live, said.append)

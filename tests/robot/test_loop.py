@@ -11,13 +11,7 @@ from hypothesis import strategies as st
 
 from pipeline.base.config import Chunking
 from pipeline.base.errors import ConfigError
-from pipeline.robot.loop import (
-    ControlLoop,
-    Executor,
-    PlanGuide,
-    check_chunking,
-    soft_mask,
-)
+from pipeline.robot.loop import ControlLoop, Executor, PlanGuide, soft_mask
 from pipeline.robot.session import stack_guides
 
 MODES = get_args(Chunking)
@@ -192,7 +186,6 @@ class TestGuide:
         """Zeros with weight would decode to the mean action."""
         executor = self.under_way(execute, played)
         guide = executor.begin()
-        assert guide is not None
         assert np.array_equal(guide.chunk[: HORIZON - played], chunk_of(played)[: 8 - played] + 1)
         ends = HORIZON - max(played, execute)
         assert (guide.weight[:ends] > 0).all() and (guide.weight[ends:] == 0).all()
@@ -204,7 +197,6 @@ class TestGuide:
         executor, held = self.under_way(execute=1), []
         for delay in (2, 1, *[0] * 11):
             guide = executor.begin()
-            assert guide is not None
             held.append(int((guide.weight == 1).sum()))
             play(executor, delay)
             executor.plan(chunk_of(0))
@@ -234,16 +226,6 @@ class TestGuide:
         assert guide.weight.tolist() == [[0] * 4, [0.5] * 4, [0] * 4]
         assert guide.chunk.sum(dim=(1, 2)).tolist() == [0, 24, 0]
         assert stack_guides([None, None], torch.device("cpu")) is None
-
-    def test_a_policy_that_draws_nothing_cannot_be_guided(self) -> None:
-        with pytest.raises(ConfigError, match=r"rollout\.chunking: .*found rtc"):
-            check_chunking("rtc", stochastic=False)
-        for chunking, stochastic in (("rtc", True), ("none", False), ("temporal", False)):
-            check_chunking(chunking, stochastic)
-
-
-def make_loop(execute: int = 1, uses_features: bool = True) -> ControlLoop:
-    return ControlLoop(Executor("none", execute, HORIZON), 3, uses_features)
 
 
 def run(loop: ControlLoop, ticks: int, latency: int = 0) -> Iterator[tuple[bool, bool, float]]:
@@ -280,7 +262,7 @@ def test_the_model_looks_every_third_tick_and_the_head_answers_as_often_as_it_is
     execute, latency, passes, asked
 ):
     """A robot stands still until its first chunk is there; the next episode begins with nothing."""
-    loop = make_loop(execute)
+    loop = ControlLoop(Executor("none", execute, HORIZON), 3, True)
     for _ in range(2):
         loop.reset()
         log = [*run(loop, 12, latency)]

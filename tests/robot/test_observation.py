@@ -8,17 +8,9 @@ import pytest
 from pipeline.base.errors import ConfigError, ObservationError
 from pipeline.robot.observation import KEY_MAPS, Doubts, ObservationReader
 from pipeline.simulation.rendering import VIEWS
+from tests.robot.conftest import SOURCE
 
-METADATA = {
-    "streams": {
-        "views": list(VIEWS),
-        "state": {"names": ["j"] * 12},
-        "sensor": {"names": ["s"] * 1026},
-    },
-    "horizon": 4,
-    "action_dim": 7,
-    "stochastic": True,
-}
+METADATA = SOURCE | {"horizon": 4, "action_dim": 7, "stochastic": True}
 
 
 def changed(array: np.ndarray, place: tuple[int, ...], value: float) -> np.ndarray:
@@ -88,7 +80,6 @@ STATE, STATE_TIME = np.zeros((10, 12)), np.arange(1, 11) / 100
     [
         ({"observation/state": STATE}, "observation/state: expected one of time, .*state_time"),
         ({"time": np.zeros(2)}, r"time: expected shape \(1\), found \(2,\)"),
-        ({"state_time": None}, "state_time: expected it beside state"),
         ({"state": np.zeros((10, 11))}, r"state: expected shape \(reading, 12\), found \(10, 11\)"),
         ({"state": [[1], [2, 3]]}, "state: expected numbers, found list"),
         ({"state": changed(STATE, (3, 2), np.nan)}, r"found nan at \(3, 2\)"),

@@ -1,16 +1,13 @@
 """Rollouts over the wire are those in process, and what cannot be the same is refused."""
 
 import json
-from collections.abc import Callable
 from contextlib import closing
 from typing import Any, ClassVar
 
 import numpy as np
 import pytest
-import torch
 
 from pipeline.base.config import RolloutParams, Source
-from pipeline.base.errors import CheckpointMismatch
 from pipeline.data import open_recordings
 from pipeline.evaluate.rollout_driver import roll_out, roll_out_served
 from pipeline.evaluate.rollouts import Rollouts
@@ -21,10 +18,8 @@ from pipeline.robot.recorder import RunRecorder
 from pipeline.simulation.environment import SimulatedRobot
 from pipeline.simulation.insertion import INSTRUCTION
 
-Served = Callable[..., Any]
 
-
-def over_the_wire(served: Any, serving: Served, **changed: Any) -> Rollouts:
+def over_the_wire(served: Any, serving: Any, **changed: Any) -> Rollouts:
     wanted = RolloutParams.model_validate({"episodes": 1, "seed": 77} | changed)
     with PolicyClient(f"ws://{serving(served).address}") as client:
         return roll_out_served(client, wanted)
@@ -40,16 +35,10 @@ def over_the_wire(served: Any, serving: Served, **changed: Any) -> Rollouts:
 def test_the_same_seed_gives_the_same_episode_bit_for_bit(
     model_type, changed, served_policy, serving
 ):
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        served = served_policy(model_type)
-        wired = over_the_wire(served, serving, **changed)
-        alone = RolloutParams.model_validate({"episodes": 1, "seed": 77, "ablations": []} | changed)
-        load: Any = lambda: served.glance  # noqa: E731
-        here = roll_out(served.checkpoint, "models/head", served.policy, load, alone)
-    finally:
-        torch.set_num_threads(threads)
+    served = served_policy(model_type)
+    wired = over_the_wire(served, serving, **changed)
+    alone = RolloutParams.model_validate({"episodes": 1, "seed": 77, "ablations": []} | changed)
+    here = roll_out(served.checkpoint, "models/head", served.policy, lambda: served.glance, alone)
     assert wired.document() == here.document()
     for policy in (True, False):
         assert wired.table(policy).csv() == here.table(policy).csv()
@@ -63,13 +52,6 @@ def test_several_steps_of_a_chunk_are_played_between_two_questions(served_policy
     steps = wired.of("policy")[0].ticks - 1  # the first tick is over when the episode begins
     # Frames go along with a question once `vlm_reuse_count` ticks lie between: every fourth tick.
     assert len(served.glance.passes) == -(-steps // 4)
-
-
-def test_another_robots_server_is_refused(served_policy, serving) -> None:
-    served = served_policy()
-    served.metadata = served.metadata | {"action_hz": 30.0}
-    with pytest.raises(CheckpointMismatch, match=r"action_hz 30, of phantom"):
-        over_the_wire(served, serving)
 
 
 def test_a_run_in_real_time_over_the_wire_is_recorded(served_policy, serving, tmp_path) -> None:
@@ -102,6 +84,4 @@ def test_a_run_in_real_time_over_the_wire_is_recorded(served_policy, serving, tm
     run = json.loads((report.recording / "run.json").read_text())
     assert run["rows"] == 5 and run["metadata"]["step"] == 1
     (recording,) = open_recordings([Source(name="runs", path=str(report.recording))]).recordings
-    action = recording.action()
-    assert action is not None
-    np.testing.assert_array_equal(action.values, np.float32(robot.acts))
+    np.testing.assert_array_equal(recording.action().values, np.float32(robot.acts))

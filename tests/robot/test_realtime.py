@@ -172,10 +172,6 @@ def after(tick: int, do: Callable[[Observed], Any]) -> Callable[[int, Observed],
     return lambda now, observed: do(observed) if now >= tick else None
 
 
-def put(name: str, value: Any) -> Callable[[Observed], None]:
-    return lambda observed: observed.__setitem__(name, value)
-
-
 def limits(**file: Any) -> Limits:
     return Limits(LimitsFile.model_validate(file), META, 200.0)
 
@@ -284,11 +280,6 @@ def test_a_plan_that_is_used_up_stops_the_robot() -> None:
     assert "ms at most; half of a chunk is 100 ms" in report.reason
 
 
-def of_question(number: int, value: float) -> Callable[[int, Observed], None]:
-    """The answer to this question has another last action."""
-    return lambda n, answer: answer["actions"].__setitem__((-1, 1), value) if n == number else None
-
-
 def fail_at(at: int, error: BaseException) -> Callable[..., None]:
     """What raises this at the call of that number."""
 
@@ -310,13 +301,13 @@ def frame_of_age(age_s: float) -> Arm:
 
 
 ALL_TIMES = ("time", "state_time", "sensor_time")
-NAN = np.full((2, 2), np.nan)
 STOPS: dict[str, Callable[[], RunReport]] = {
     "a first chunk that never comes": lambda: stopped(
         Arm(), StopKind.NO_CHUNK, "first chunk", Brain().after(0.3), first_answer_s=0.1
     ),
     "an action that is no number": lambda: stopped(
-        Arm(), StopKind.NOT_A_NUMBER, "the policy's action", Brain(of_question(5, np.nan))
+        Arm(), StopKind.NOT_A_NUMBER, "the policy's action",
+        Brain(lambda n, answer: answer["actions"][-1].fill(np.nan if n == 5 else 0.1)),
     ),
     "a jump beyond limits": lambda: stopped(
         Arm(), StopKind.LIMIT, "step of translation",
@@ -336,16 +327,9 @@ STOPS: dict[str, Callable[[], RunReport]] = {
     ),
     "an old frame": lambda: stopped(frame_of_age(1.0), StopKind.CAMERA, "1.00 s old"),
     "a frame of the future": lambda: stopped(frame_of_age(-1.0), StopKind.CAMERA, "-1.00 s old"),
-    "a state that is no number": lambda: stopped(
-        Arm(after(9, put("state", NAN))), StopKind.NOT_A_NUMBER, "state"
-    ),
     "a chunk of another shape": lambda: stopped(
         Arm(), StopKind.POLICY, "(40, 2), found (40, 3)",
         Brain(lambda n, answer: answer.update(actions=np.zeros((HORIZON, 3)))),
-    ),
-    "too much force": lambda: stopped(
-        Arm(after(9, put("sensor", np.array([[-3.0]], np.float32)))), StopKind.FORCE,
-        "force measured at -3", limits=limits(force={"most": {"force": 2.5}}),
     ),
     "leaving the workspace": lambda: stopped(
         Arm(), StopKind.WORKSPACE, "x measured at 13",
@@ -411,14 +395,10 @@ def test_one_slow_tick_is_counted() -> None:
     assert len(arm.acts) == 49, "no two actions of one tick, and none of those left out"
 
 
-@pytest.mark.parametrize("where", ["observe", "act", "frames"])
-def test_an_exception_in_the_robots_code_stops_it_and_is_told(where: str) -> None:
-    fail = fail_at(7, RuntimeError("bus error"))
-    arm = Arm(**{{"observe": "spoil", "act": "moves", "frames": "sees"}[where]: fail})
-    report = stopped(
-        arm, StopKind.ROBOT, f"the robot's code failed ({where}): RuntimeError: bus error"
-    )
-    assert "raise error" in report.traceback
+def test_an_exception_in_the_robots_code_stops_it_and_is_told() -> None:
+    arm = Arm(sees=fail_at(7, RuntimeError("bus error")))
+    said = "the robot's code failed (frames): RuntimeError: bus error"
+    assert "raise error" in stopped(arm, StopKind.ROBOT, said).traceback
 
 
 ENDINGS = [signal.SIGINT, signal.SIGTERM, signal.SIGHUP]
@@ -475,7 +455,7 @@ class Stubborn(Arm):
 
 def test_a_stop_that_fails_is_tried_again_and_hides_nothing() -> None:
     arm, notes = Stubborn(fail_at(6, RuntimeError("bus error"))), Notes()
-    report = stopped(arm, StopKind.ROBOT, "bus error", recorder=notes)
+    report = stopped(arm, StopKind.ROBOT, "failed (observe): RuntimeError", recorder=notes)
     assert len(arm.stops) == 2 and notes.reason == report.reason
     assert report.recording == Path("recording")
     assert report.traceback.count("robot.stop failed: Traceback") == 1
@@ -497,15 +477,15 @@ def test_a_recording_that_cannot_be_finished_hides_no_reason() -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "value", "kind"),
+    ("name", "value", "kind", "said"),
     [
-        ("sensor", np.array([[-3.0]], np.float32), StopKind.FORCE),
-        ("state", np.full((2, 2), np.nan, np.float32), StopKind.NOT_A_NUMBER),
+        ("sensor", np.array([[-3.0]], np.float32), StopKind.FORCE, "force measured at -3"),
+        ("state", np.full((2, 2), np.nan, np.float32), StopKind.NOT_A_NUMBER, "state"),
     ],
 )
-def test_the_tick_that_stops_the_robot_is_recorded(name: str, value: Any, kind: StopKind) -> None:
-    notes, arm = Notes(), Arm(after(9, put(name, value)))
-    stopped(arm, kind, "", recorder=notes, limits=limits(force={"most": {"force": 2.5}}))
+def test_the_tick_that_stops_the_robot_is_recorded(name, value, kind, said) -> None:
+    notes, arm = Notes(), Arm(after(9, lambda seen: seen.update({name: value})))
+    stopped(arm, kind, said, recorder=notes, limits=limits(force={"most": {"force": 2.5}}))
     assert len(notes.ticks) == arm.ticks == 10
     observed, action = notes.ticks[-1]
     assert observed[name] is value and action is None

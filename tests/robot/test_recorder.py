@@ -14,7 +14,6 @@ from pipeline.base.config import Params, Source
 from pipeline.base.digests import file_digest
 from pipeline.base.errors import RecordingError
 from pipeline.data import Recording, open_recordings
-from pipeline.data.insertion import SENSOR, STATE
 from pipeline.extract import extract
 from pipeline.robot import recorder as recorder_module
 from pipeline.robot.recorder import RunRecorder, encode_png, recover
@@ -24,6 +23,7 @@ from pipeline.simulation.rendering import VIEWS
 from pipeline.store import FeatureStore
 from pipeline.vlm.feature_spec import feature_spec
 from pipeline.vlm.preparation import Preparer
+from tests.robot.conftest import SOURCE
 
 REUSE = 3
 Frames = Mapping[str, tuple[float, np.ndarray]]
@@ -31,16 +31,9 @@ Frames = Mapping[str, tuple[float, np.ndarray]]
 
 def metadata_of(**changed: Any) -> dict[str, Any]:
     """What a policy for the phantom says of itself, as far as a recorder reads it."""
-    action = {"names": ["dx", "dy", "dz", "rx", "ry", "rz", "gripper"], "kind": "delta"}
-    streams: dict[str, Any] = {
-        "action": action | {"units": ["mm"] * 3 + ["deg"] * 3 + [""]},
-        "state": {"names": list(STATE.names), "units": list(STATE.units)},
-        "sensor": {"names": list(SENSOR.names), "units": list(SENSOR.units)},
-        "views": list(VIEWS),
-    }
     spec = {"digest": "d", "prompt": "p"}
     told = {"action_hz": 10.0, "feature_spec": spec, "feature_spec_digest": "d"}
-    return told | {"streams": streams | changed}
+    return told | {"streams": SOURCE["streams"] | changed}
 
 
 @dataclass
@@ -57,7 +50,7 @@ class Driven:
 def drive(
     folder: Path,
     metadata: Mapping[str, Any],
-    key_of: Callable[[Frames], bytes],
+    key_of: Callable[[Frames], bytes] = lambda frames: bytes(16),
     ticks: int | None = None,
 ) -> Driven:
     """The demonstrator's episode; every third tick is looked at."""
@@ -81,10 +74,6 @@ def drive(
         observed = environment.step(action)[0]
         tick += 1
     return driven
-
-
-def no_key(frames: Frames) -> bytes:
-    return bytes(16)
 
 
 def opened(folder: Path) -> Recording:
@@ -132,7 +121,6 @@ def test_a_run_comes_back_as_it_was_and_says_how_it_ended(run) -> None:
     np.testing.assert_array_equal(action.values, np.stack(driven.sent))
     np.testing.assert_array_equal(action.time, np.array(driven.time) - start)
     for name, stream in (("state", recording.state()), ("sensor", recording.sensor())):
-        assert stream is not None
         values, times = (np.concatenate(driven.readings[key]) for key in (name, f"{name}_time"))
         np.testing.assert_array_equal(stream.values, values.astype(np.float32))
         np.testing.assert_array_equal(stream.time, times - start)
@@ -183,15 +171,14 @@ NONE: dict[str, Any] = {"names": [], "units": []}
 
 
 def test_streams_that_the_policy_lacks_are_not_recorded(tmp_path) -> None:
-    path = drive(tmp_path, metadata_of(sensor=NONE), no_key, ticks=5).recorder.finish("done")
+    path = drive(tmp_path, metadata_of(sensor=NONE), ticks=5).recorder.finish("done")
     recording = opened(path)
     assert recording.sensor() is None and recording.state() is not None
     recorder = RunRecorder(tmp_path, metadata_of(state=NONE, sensor=NONE, views=[]), "Push")
     for tick in range(4):
         recorder.tick(observed_at(tick), np.full(7, tick))
     recording = opened(recorder.finish("done"))
-    action = recording.action()
-    assert action is not None and action.values[:, 0].tolist() == [0, 1, 2, 3]
+    assert recording.action().values[:, 0].tolist() == [0, 1, 2, 3]
     assert recording.state() is None and not recording.cameras()
 
 
@@ -204,8 +191,7 @@ def test_rows_begin_when_all_streams_have_and_a_view_that_never_came_is_missing(
         recorder.tick(observed_at(tick, **(state_at(tick) if tick else {})), action)
     path = recorder.finish("done")
     recording = opened(path)
-    action = recording.action()
-    assert action is not None and action.values[:, 0].tolist() == [3, 5]
+    assert recording.action().values[:, 0].tolist() == [3, 5]
     assert end_of(path)["start_s"] == 5.3 and list(recording.cameras()) == ["View1"]
 
 
@@ -245,9 +231,7 @@ def test_readings_that_are_no_numbers_are_left_out(tmp_path) -> None:
     late = {"state": state[:2] * 0, "state_time": np.array([4.0, np.nan])}
     recorder.tick(observed_at(2, **late), None)
     path = recorder.finish("safe stop: the state is not a number")
-    found = opened(path).state()
-    assert found is not None
-    np.testing.assert_array_equal(found.values, state[[0, 3]])
+    np.testing.assert_array_equal(opened(path).state().values, state[[0, 3]])
 
 
 def test_images_that_find_no_room_are_dropped_and_counted(tmp_path, monkeypatch) -> None:
@@ -300,11 +284,9 @@ def test_a_recording_is_one_episode(tmp_path) -> None:
     recorder = RunRecorder(tmp_path, metadata_of(), "Push")
     for tick in range(4):
         recorder.tick(observed_at(tick % 3, reset=tick % 3 == 0), np.full(7, tick))
-    assert recorder.failed is not None
     with pytest.raises(RecordingError, match="another episode begins"):
         recorder.finish("done")
-    action = opened(recover(recorder.part)).action()
-    assert action is not None and action.values[:, 0].tolist() == [0, 1, 2]
+    assert opened(recover(recorder.part)).action().values[:, 0].tolist() == [0, 1, 2]
 
 
 def test_a_run_that_stops_before_its_first_action_is_recorded(tmp_path) -> None:
@@ -316,8 +298,7 @@ def test_a_run_that_stops_before_its_first_action_is_recorded(tmp_path) -> None:
     recorder.tick({"time": np.array([0.0])}, None)  # a clock that stopped the robot
     path = recorder.finish("step of kLeftElbow would be 1.231, at most 0.2")
     recording, said = opened(path), end_of(path)
-    state = recording.state()
-    assert state is not None and state.values[:, 0].tolist() == [0, 1, 2, 3]
+    assert recording.state().values[:, 0].tolist() == [0, 1, 2, 3]
     assert shades(recording.cameras()["View1"]) == [7]
     assert (said["rows"], said["ticks"]) == (3, 5) and said["reason"].startswith("step of")
     with pytest.raises(RecordingError, match="no feature 'action'"):

@@ -8,7 +8,6 @@ from collections.abc import Generator
 from contextlib import contextmanager
 from typing import Any
 
-import msgpack
 import numpy as np
 import pytest
 import torch
@@ -20,6 +19,7 @@ from pipeline.base.errors import ConfigError
 from pipeline.robot import wire
 from pipeline.robot.client import PolicyClient
 from pipeline.robot.server import PolicyServer, listen, read_token
+from tests.robot.conftest import Blocked
 
 
 def get(server: PolicyServer, path: str, **headers: str) -> tuple[int, str, dict[str, str]]:
@@ -45,23 +45,10 @@ def opened(server: PolicyServer, **options: Any) -> Generator[ClientConnection]:
         yield bare
 
 
-class Blocked:
-    """Keeps the model of a served policy waiting, once it has begun to look, until `go`."""
-
-    def __init__(self, served: Any) -> None:
-        self.looking, self.go = threading.Event(), threading.Event()
-        served.glance.before = self
-
-    def __call__(self) -> None:
-        self.looking.set()
-        assert self.go.wait(60)
-
-
 def closing_code(bare: ClientConnection) -> int:
     """The code with which the server closes a connection, next."""
     with pytest.raises(ConnectionClosed) as closed:
         bare.recv(20)
-    assert closed.value.rcvd is not None
     return closed.value.rcvd.code
 
 
@@ -94,15 +81,11 @@ def test_observations_of_one_connection_are_answered_in_order(served_policy, ser
     np.testing.assert_allclose(ages, [0, 0.1, 0.2, 0, 0.1, 0.2, 0], atol=1e-6)
 
 
-def array_of(dtype: str, shape: Any, data: bytes) -> dict[bytes, Any]:
-    return {b"__ndarray__": True, b"dtype": dtype, b"shape": shape, b"data": data}
-
-
 @pytest.mark.parametrize(
     ("message", "said", "code"),
     [
         ("time", "refused: expected a message of bytes (msgpack), found a text", 1003),
-        (msgpack.packb({"time": array_of("|O", [1], b"0")}), "refused: expected the dtype", 1007),
+        (b"\x91", "refused: expected a message in msgpack, found none", 1007),
         (wire.pack({"time": 0.1, "gripper": 1}), "refused: gripper: expected one of", 1008),
     ],
 )
@@ -267,8 +250,6 @@ def test_an_address_that_is_taken_or_somebody_elses_is_refused() -> None:
             listen(params(port=port))
     with pytest.raises(ConfigError, match=r"serve\.port: 192\.0\.2\.1"):
         listen(params(host="192.0.2.1"))
-    with pytest.raises(ConfigError, match=r"serve\.port: no\.such\.invalid"):
-        listen(params(host="no.such.invalid"))
 
 
 def test_a_robot_counts_until_its_observation_is_answered_though_it_has_left(

@@ -51,8 +51,7 @@ def broken(rng: np.random.Generator, fields: dict[str, Any]) -> Any:
 def is_refused(rng: np.random.Generator, address: str, fields: dict[str, Any]) -> bool:
     """Send a broken message, after a good one sometimes; whether it was refused."""
     message = broken(rng, fields)
-    options: Any = {"compression": None, "max_size": None, "proxy": None}
-    with connect(f"ws://{address}", **options) as bare:
+    with connect(f"ws://{address}", compression=None, max_size=None, proxy=None) as bare:
         assert isinstance(bare.recv(20), bytes)
         try:
             if rng.random() < 0.2:

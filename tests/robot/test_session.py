@@ -1,6 +1,5 @@
 """A session answers as a rollout does, remembers one robot, and refuses what it cannot use."""
 
-import threading
 from collections import deque
 from typing import Any
 
@@ -11,6 +10,7 @@ import torch
 from pipeline.base.errors import NumericsError, ObservationError
 from pipeline.simulation.insertion import INSTRUCTION
 from pipeline.simulation.rendering import VIEWS
+from tests.robot.conftest import Blocked, watch
 
 BLIND: dict[str, Any] = {f"images/{view}": None for view in VIEWS}
 
@@ -73,13 +73,7 @@ def test_prompts(served_policy, observe) -> None:
 
 def test_a_missing_view_is_left_out_as_in_training(served_policy, observe, monkeypatch) -> None:
     served = served_policy()
-    given, policy_observe = [], served.policy.observe
-
-    def watched(streams: Any) -> Any:
-        given.append(streams)
-        return policy_observe(streams)
-
-    monkeypatch.setattr(served.policy, "observe", watched)
+    given = watch(monkeypatch, served.policy)
     served.session().infer(observe(0, **{f"images/{VIEWS[0]}": None}))
     assert tuple(served.glance.passes[0][0]) == VIEWS[1:]
     assert given[0]["slot_valid"].tolist() == [[False, True]]
@@ -123,25 +117,18 @@ def test_what_is_not_fresh_is_answered_while_the_model_looks(served_policy, obse
     served = served_policy()
     session = served.session(fresh=False)
     session.infer(observe(0))  # the first is waited for
-    go, looking = threading.Event(), threading.Event()
-
-    def wait() -> None:
-        looking.set()
-        assert go.wait(60)
-
-    served.glance.before = wait
+    blocked = Blocked(served)
     for tick in range(1, 10):
         age_s = session.infer(observe(tick))["feature_age_s"]
         assert age_s == pytest.approx(tick / 10, abs=1e-6)
-        assert tick != 3 or looking.wait(60), "the pass has the frames of tick 3, and no newer ones"
-    go.set()
+        assert tick != 3 or blocked.looking.wait(60), "the pass has frames of tick 3, none newer"
+    blocked.go.set()
     served.begin_pass(deque()).exception()  # passes are in order: that one has ended
-    later = threading.Event()
-    served.glance.before = lambda: later.wait(60)  # the next pass does not end at once
+    later = Blocked(served)  # the next pass does not end at once
     answer = session.infer(observe(10))
     assert answer["feature_age_s"] == pytest.approx(0.7, abs=1e-6)
     assert answer["server_timing"]["vlm_ms"] > 0
-    later.set()
+    later.go.set()
     served.begin_pass(deque()).exception()
     # Frames of tick 9 waited in the place of those of tick 6.
     assert session.infer(observe(11))["feature_age_s"] == pytest.approx(0.2, abs=1e-6)
@@ -151,15 +138,14 @@ def test_a_pass_of_the_episode_before_is_not_taken(served_policy, observe) -> No
     served = served_policy()
     session = served.session(fresh=False)
     session.infer(observe(0))
-    go = threading.Event()
-    served.glance.before = lambda: go.wait(20)
+    blocked = Blocked(served)
     session.infer(observe(3))  # begins a pass that does not end
     served.glance.before = lambda: None
     begin = served.begin_pass
 
     def begin_and_end_the_other(waiting: Any) -> Any:
         begun = begin(waiting)
-        go.set()
+        blocked.go.set()
         return begun
 
     served.begin_pass = begin_and_end_the_other

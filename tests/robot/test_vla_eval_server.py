@@ -21,8 +21,7 @@ from vla_eval.connection import Connection  # noqa: E402
 
 from experiments.vla_eval_server import PolicyModelServer  # noqa: E402
 
-ROOT = Path(__file__).parents[2]
-PARAMS = ROOT / "params.yaml"
+PARAMS = Path(__file__).parents[2] / "params.yaml"
 CAMERAS = dict(zip(VIEWS, ("agentview", "wrist", "side", "top", "back"), strict=False))
 NAMES = {f"images/{view}": f"images/{camera}" for view, camera in CAMERAS.items()}
 NAMES |= {"state": "states"}

@@ -3,19 +3,11 @@
 import numpy as np
 import pytest
 
-from pipeline.simulation.interface import RobotEnvironment
-
 
 class EnvironmentContract:
-    """Subclass it with a fixture `environment`."""
+    """Subclass it with a fixture `environment`, which gives a `RobotEnvironment`."""
 
-    @pytest.fixture
-    def environment(self) -> RobotEnvironment:
-        raise NotImplementedError
-
-    def test_the_same_seed_and_actions_are_the_same_episode(
-        self, environment: RobotEnvironment
-    ) -> None:
+    def test_the_same_seed_and_actions_are_the_same_episode(self, environment) -> None:
         """Whatever was played before: each way of running a policy meets the same episodes."""
         played = []
         for seed in (7, 8, 7):
@@ -31,9 +23,7 @@ class EnvironmentContract:
         np.testing.assert_equal(first[1], again[1])
         assert any(not np.array_equal(frame, other[1][view]) for view, frame in first[1].items())
 
-    def test_observations_have_the_streams_of_the_robot(
-        self, environment: RobotEnvironment
-    ) -> None:
+    def test_observations_have_the_streams_of_the_robot(self, environment) -> None:
         robot = environment.robot
         readings, _ = environment.reset(seed=3)
         for _ in range(3):
@@ -51,9 +41,7 @@ class EnvironmentContract:
                     assert before_s - 1e-9 < times[0] and times[-1] <= now_s + 1e-9
         assert environment.action_space.shape == (len(robot.action.names),)
 
-    def test_frames_are_those_of_the_views_and_no_newer_than_now(
-        self, environment: RobotEnvironment
-    ) -> None:
+    def test_frames_are_those_of_the_views_and_no_newer_than_now(self, environment) -> None:
         readings, _ = environment.reset(seed=3)
         shots = environment.frames()
         assert tuple(shots) == environment.robot.views

@@ -54,7 +54,6 @@ def test_a_set_reads_back_as_what_was_simulated(demo_root, name: str) -> None:
     for recording, truth in zip(found, simulated(name), strict=True):
         assert recording.format == name
         state, sensor = recording.state(), recording.sensor()
-        assert state is not None and sensor is not None
         # LeRobot counts from its first row, which is a tick after the beginning.
         origin = truth.epoch_s + 0.1 if name == "lerobot" else 0.0
         poses = truth.poses(state.time + origin)
@@ -89,7 +88,6 @@ def test_all_formats_are_one_embodiment_whose_actions_lead_from_pose_to_pose(dem
     for name in SETS:
         for recording, truth in zip(recordings(demo_root, name), simulated(name), strict=True):
             state, sensor, action = recording.state(), recording.sensor(), recording.action()
-            assert state is not None and sensor is not None
             channels.add((state.channels, sensor.channels))
             if name in ("raw", "new"):
                 assert action is None and recording.poses() is not None
@@ -106,7 +104,6 @@ def test_all_formats_are_one_embodiment_whose_actions_lead_from_pose_to_pose(dem
 def test_clocks_start_apart_and_jitter_and_one_episode_crosses_180(demo_root) -> None:
     recording = recordings(demo_root, "raw")[0]
     state, sensor = recording.state(), recording.sensor()
-    assert state is not None and sensor is not None
     clocks = [state.time, sensor.time, *(c.time for c in recording.cameras().values())]
     assert len({clock[0] for clock in clocks}) == len(clocks)
     for clock in clocks:

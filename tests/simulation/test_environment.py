@@ -4,7 +4,6 @@ import warnings
 from collections.abc import Iterator
 from contextlib import closing
 from queue import SimpleQueue
-from typing import Any
 
 import numpy as np
 import pytest
@@ -76,11 +75,10 @@ def test_frames_are_those_taken_last() -> None:
 
 
 def test_what_makes_no_sense_is_refused() -> None:
-    wrong: Any = "hard"
     with pytest.raises(ValueError, match="depth, full, moved, found 'hard'"):
-        InsertionEnvironment(wrong)
+        InsertionEnvironment("hard")
     with pytest.raises(ValueError, match="found 'hard'"):
-        InsertionEnvironment(action_rotation=wrong)
+        InsertionEnvironment(action_rotation="hard")
     environment = InsertionEnvironment()
     drawn = [environment.reset(seed=seed)[0]["state"] for seed in (1, 2, None, None)]
     assert len({state.tobytes() for state in drawn}) == 4, "None draws a seed"

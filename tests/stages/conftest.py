@@ -77,32 +77,30 @@ def trained(trained_once: Path, tmp_path_factory: pytest.TempPathFactory) -> Pat
     return path
 
 
-@pytest.fixture
-def started() -> Callable[[str, Path], Process]:
-    """`started(code, params)`: a process that runs this Python with the file of params."""
+BLOCKER = """
+import sys
 
-    def start(code: str, params: Path) -> Process:
+class Blocker:
+    def find_spec(self, name, path=None, target=None):
+        if name.split(".")[0] in PACKAGES:
+            raise ImportError(f"No module named {name!r}")
+
+sys.meta_path.insert(0, Blocker())
+"""
+
+
+@pytest.fixture
+def started() -> Callable[..., Process]:
+    """`started(code, params, without=packages)`: a process that runs this Python with the file of
+    params and cannot import these packages."""
+
+    def start(code: str, params: Path, without: tuple[str, ...]) -> Process:
         return subprocess.Popen(
-            [sys.executable, "-c", code, str(params)],
+            [sys.executable, "-c", BLOCKER.replace("PACKAGES", repr(without)) + code, str(params)],
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,
             env=os.environ | {"PYTHONPATH": str(ROOT)},
         )
-
-    return start
-
-
-@pytest.fixture
-def started_until(started: Callable[[str, Path], Process]) -> Callable[[str, Path, str], Process]:
-    """`started_until(code, params, line)`: the process once it has printed that line."""
-
-    def start(code: str, params: Path, line: str) -> Process:
-        process = started(code, params)
-        assert process.stdout is not None
-        for said in process.stdout:
-            if said.strip() == line:
-                return process
-        raise AssertionError(f"ended before {line!r}")
 
     return start

@@ -54,12 +54,3 @@ def test_a_place_that_no_archive_can_have(call, capsys, tmp_path):
     assert "not an archive of" in refused(call, capsys, f"archive.output={call.store}")
     output = f"archive.output={tmp_path / 'kept'}"
     assert f"Set {output}.zarr" in refused(call, capsys, output)
-    place = f"archive.store={tmp_path / 'no.zarr'}"
-    assert "Run python -m stages.extract" in refused(call, capsys, place)
-    assert call("--restore") == 2
-    assert "make it with stages.archive" in capsys.readouterr().err
-    other = tmp_path / "other.zarr"
-    other.mkdir()
-    (other / "notes").write_text("mine")
-    assert "not an archive of" in refused(call, capsys, f"archive.output={other}")
-    assert (other / "notes").read_text() == "mine"

@@ -37,25 +37,20 @@ def experiments(
     path.write_text(yaml.safe_dump(document))
     for name in NAMES:
         expert, fusion = name.split("-")
-        options = [f"train_head.model_type={expert}", f"train_head.fusion_strategy={fusion}"]
-        assert evaluated(path, name, *options) == 0
+        own = [
+            f"train_head.model_type={expert}",
+            f"train_head.fusion_strategy={fusion}",
+            f"train_head.output={folder / 'models' / name}",
+            f"train_head.logs={folder / 'logs' / name}",
+            f"evaluate.checkpoint={folder / 'models' / name}",
+            f"evaluate.output={folder / 'reports' / name}",
+        ]
+        arguments = ["--params", str(path), *(part for one in own for part in ("--set", one))]
+        with pytest.MonkeyPatch.context() as monkeypatch:  # its own page is not what is compared
+            monkeypatch.setattr(writing, "write_report", lambda *_: [])
+            assert run("", train_head.main, arguments) == 0
+            assert run("", evaluate.main, arguments) == 0
     return path
-
-
-def evaluated(params: Path, name: str, *options: str) -> int:
-    """Train and evaluate an experiment of this name; its own page is not what is compared."""
-    folder = params.parent
-    own = [
-        *options,
-        f"train_head.output={folder / 'models' / name}",
-        f"train_head.logs={folder / 'logs' / name}",
-        f"evaluate.checkpoint={folder / 'models' / name}",
-        f"evaluate.output={folder / 'reports' / name}",
-    ]
-    arguments = ["--params", str(params), *(part for one in own for part in ("--set", one))]
-    with pytest.MonkeyPatch.context() as monkeypatch:
-        monkeypatch.setattr(writing, "write_report", lambda *_: [])
-        return run("", train_head.main, arguments) or run("", evaluate.main, arguments)
 
 
 @pytest.fixture

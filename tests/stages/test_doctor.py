@@ -13,15 +13,8 @@ from stages import doctor
 from stages.command import run
 
 Start = Callable[..., "subprocess.Popen[str]"]
-WITHOUT = """
+DOCTOR = """
 import sys
-
-class Blocker:
-    def find_spec(self, name, path=None, target=None):
-        if name.split(".")[0] in ("torch", "av"):
-            raise ImportError(f"No module named {name!r}")
-
-sys.meta_path.insert(0, Blocker())
 from stages import doctor
 from stages.command import run
 
@@ -55,7 +48,7 @@ def test_where_nothing_is_missing(params: Path, capsys: pytest.CaptureFixture[st
 
 
 def test_where_packages_are_not_installed(started: Start, params: Path) -> None:
-    process = started(WITHOUT, params)
+    process = started(DOCTOR, params, without=("torch", "av"))
     out, err = process.communicate(timeout=100)
     assert process.returncode == 2, err
     assert "Traceback" not in err

@@ -101,17 +101,14 @@ def test_what_cannot_be_probed_is_said(params, tiny_store, tmp_path, capsys):
     assert not (params.parent / "report").exists()
 
 
-def test_a_damaged_store_is_refused(params, tiny_store, tmp_path, capsys):
+def test_a_damaged_store_is_refused(params, tiny_store, flip, tmp_path, capsys):
     store = tiny_store(tmp_path, name="sound", episodes=6)
     arguments = ["--params", str(params), "--set", f"probe.store={store}"]
     checked = [*arguments, "--set", "probe.check_store=true"]
     assert run("", probe.main, checked) == 0
     assert "3 slots of 8 channels at 180 ticks" in capsys.readouterr().out
     (params.parent / "report" / "metrics.json").unlink()
-    chunk = store / "vl" / "features" / "c" / "0" / "0" / "0"
-    damaged = bytearray(chunk.read_bytes())
-    damaged[100] ^= 1
-    chunk.write_bytes(damaged)
+    flip(store, "vl/features")
     assert run("", probe.main, checked) == 2
     error = capsys.readouterr().err
     assert "vl/features" in error

@@ -45,9 +45,6 @@ def test_what_cannot_be_run_is_refused_by_name(trained: Path, capsys: Said) -> N
     for changed, message in cases:
         assert run("", rollout.main, arguments(trained, **changed)) == 2
         assert message in capsys.readouterr().err
-    other = ["--set", "vlm.image_resize_width=112"]
-    assert run("", rollout.main, [*arguments(trained), *other]) == 2
-    assert "the policy was trained on other features" in capsys.readouterr().err
     assert not (trained.parent / "rollout").exists()
 
 

@@ -1,13 +1,11 @@
 """`stages.verify` as a user meets it: exit codes, what is said, and what to run next."""
 
-import shutil
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 
-from pipeline.base.errors import CheckpointMismatch
 from pipeline.extract.engine import ExtractionReport, Speed
 from pipeline.extract.row_check import Deviation, Reextraction
 from pipeline.store import part_path
@@ -18,14 +16,9 @@ ROOT = Path(__file__).resolve().parents[2]
 CPU = ("--set", "serve.device=cpu", "--set", "extract.device=cuda:7")
 
 
-@pytest.fixture(scope="module")
-def original(tiny_store, tmp_path_factory) -> Path:
-    return tiny_store(tmp_path_factory.mktemp("original"))
-
-
 @pytest.fixture
-def store(original, tmp_path) -> Path:
-    return Path(shutil.copytree(original, tmp_path / "tiny.zarr"))
+def store(tiny_store, tmp_path) -> Path:
+    return tiny_store(tmp_path)
 
 
 @pytest.fixture
@@ -61,7 +54,6 @@ def test_a_damaged_store_says_what_is_wrong_and_what_to_run_next(verified, store
     assert err.startswith(f"error: {store}: the store is damaged:\n")
     assert "row 17 of vl/features does not give its checksum" in err
     assert f"python -m stages.verify --repair --set verify.store={store} --params " in err
-    assert ", which keeps what is sound." in err
 
 
 def test_repair_makes_the_store_again(verified, store, capsys, monkeypatch):
@@ -75,12 +67,6 @@ def test_repair_makes_the_store_again(verified, store, capsys, monkeypatch):
     assert verified("--repair", "--set", "extract.plan=true") == 0
     said = capsys.readouterr().out
     assert f"{store}: repaired: 60 rows, 1 computed (1.0 rows/s), 59 taken over" in said
-
-
-def test_a_store_that_is_not_finished(verified, store, capsys):
-    store.rename(part_path(store))
-    assert verified() == 2
-    assert "only the unfinished build" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(("relative", "code"), [(1e-5, 0), (0.5, 2)])
@@ -112,8 +98,6 @@ class TestCheckpoint:
 
         def prove(checkpoint, features, say):
             calls.append((checkpoint, features))
-            if features[2] == "meta":
-                raise CheckpointMismatch("2 of 2 golden rows are not the features")
             say("2 golden rows computed again")
 
         monkeypatch.setattr("pipeline.policy.checkpoint.load_policy", lambda folder: held)
@@ -149,17 +133,3 @@ class TestCheckpoint:
         assert verified("--checkpoint", str(tmp_path / "head"), *CPU) == 0
         assert "looks at no features, so nothing is to be proved" in capsys.readouterr().out
         assert proved == []
-
-    def test_a_refusal(self, verified, proved, tmp_path, capsys, monkeypatch):
-        monkeypatch.setattr("pipeline.base.hardware.resolve_device", lambda name: "meta")
-        assert verified("--checkpoint", str(tmp_path / "head")) == 2
-        assert capsys.readouterr().err.startswith("error: 2 of 2 golden rows are not")
-
-
-def test_a_damaged_golden_row_is_named(verified, tiny_golden, tmp_path, capsys):
-    store = tiny_golden(tmp_path, name="golden")
-    (store / "golden/1/View1/c/0/0/0").unlink()
-    place = ("--set", f"verify.store={store}")
-    assert verified(*place) == 2
-    said = capsys.readouterr().err
-    assert f"{store / 'golden/1/View1/c/0/0/0'}: no such file" in said, said

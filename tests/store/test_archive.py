@@ -10,13 +10,12 @@ from pathlib import Path
 from typing import Any
 
 import dask.array
-import google_crc32c
 import numpy as np
 import pytest
 import zarr
 
 import pipeline.store.archive as archives
-from pipeline.base.errors import ConfigError, DiskFull, StoreIncomplete, StoreLocked, StoreMismatch
+from pipeline.base.errors import DiskFull, StoreIncomplete, StoreLocked, StoreMismatch
 from pipeline.store import FeatureStore, Sizes, StoreBuild, arrays, build_lock, part_path, schema
 from pipeline.store.archive import archive, is_archive, restore
 from pipeline.store.schema import INCREMENTAL, read_specs
@@ -104,7 +103,6 @@ def archived(tmp_path, originals) -> tuple[Path, Path]:
         ("float16", "float16", {"slot": 6}),
         ("bfloat16", "float32", {"sensor_reading": 0}),
         ("float32", "float32", {"sensor_reading": 0, "channel": 0}),
-        ("float32", "float32", {"state_reading": 0, "state_dim": 0}),
     ],
 )
 def test_every_byte_of_every_file_comes_back(tmp_path, features, sensor, sizes):
@@ -116,13 +114,6 @@ def test_every_byte_of_every_file_comes_back(tmp_path, features, sensor, sizes):
     assert content(back) == before == content(store)
     assert not part_path(output).exists()
     assert raw == sum(spec.data_bytes for spec in read_specs(store).values())
-
-
-def test_chunks_of_the_real_sizes(tiny_store, tmp_path):
-    store, back = tiny_store(tmp_path), tmp_path / "back.zarr"
-    archive(store, tmp_path / "a.zarr", level=5, threads=2)
-    restore(tmp_path / "a.zarr", back, threads=2)
-    assert content(back) == content(store)
 
 
 class TestArchive:
@@ -171,22 +162,12 @@ class TestArchive:
             restore(originals / "s.archive.zarr", target, threads=2)
 
 
-def sealed_wrong(store: Path) -> None:
-    """A feature row that only its own checksum shows to be wrong."""
-    put(store, "vl/features", 100, 1.0)
-
-
 @pytest.mark.parametrize(
     ("harm", "match"),
     [
         (
             lambda store: flip(store / "sensor/values/c/2/0", 1000),
             r"sensor/values/c/2/0: expected the crc32c .*stages\.verify",
-        ),
-        (sealed_wrong, r"c/0/0/0: row 100 of vl/features.*stages\.verify"),
-        (
-            lambda store: edit(store / "vl/zarr.json", lambda it: it["attributes"].clear()),
-            r"metadata were changed.*stages\.verify --repair",
         ),
         (shutil.rmtree, r"Run python -m stages\.extract"),
     ],
@@ -208,13 +189,6 @@ DAMAGES: dict[str, tuple[Callable[[Path], object], str]] = {
         lambda a: shutil.copy(a / "vl/features/c/1/0/0", a / "vl/features/c/0/0/0"),
         "archive is damaged: .*vl/features",
     ),
-    "no array": (lambda a: shutil.rmtree(a / "tick/action"), "archive is damaged: .*tick/action"),
-    "manifest": (
-        lambda a: (a / "zarr.json").write_text(
-            (a / "zarr.json").read_text().replace("\\u00b5m", "\\u00b6m")
-        ),
-        "metadata were changed",
-    ),
 }
 
 
@@ -235,20 +209,6 @@ class TestDamagedArchive:
             restore(archived[1], tmp_path / "back.zarr", threads=2)
 
 
-def forge_rows(store: Path) -> None:
-    """Other values under a right trailer."""
-    path = store / "tick/action/c/0/0"
-    data = bytes(path.stat().st_size - 4)
-    path.write_bytes(data + google_crc32c.value(data).to_bytes(4, "little"))
-
-
-def replace_by_notes(store: Path) -> None:
-    """A folder of the user."""
-    shutil.rmtree(store)
-    store.mkdir()
-    (store / "notes").write_text("mine")
-
-
 class TestRestore:
     def test_an_equal_store_is_left_as_it_is(self, archived):
         store, output = archived
@@ -259,18 +219,16 @@ class TestRestore:
     @pytest.mark.parametrize(
         "change",
         [
-            forge_rows,
-            replace_by_notes,
             lambda store: edit(store / "zarr.json", lambda it: it["attributes"].update(note="")),
-            lambda store: (store / "tick/action/c/0/0").unlink(),
+            lambda store: flip(store / "tick/action/c/0/0", 9),
         ],
     )
     def test_another_store_is_not_written_over(self, archived, change):
         store, output = archived
         change(store)
         before = content(store)
-        match = r"not the archived store.*archive\.store|a folder with notes|tick/action/c/0/0: "
-        with pytest.raises((StoreMismatch, ConfigError, StoreIncomplete), match=match):
+        match = r"not the archived store.*archive\.store|tick/action/c/0/0: "
+        with pytest.raises((StoreMismatch, StoreIncomplete), match=match):
             restore(output, store, threads=2)
         assert content(store) == before
 

@@ -47,11 +47,6 @@ class TestSound:
         assert golden.features.dtype == np.float32
         assert np.array_equal((golden.features.view(np.uint32) >> 16).astype(np.uint16), bits)
 
-    def test_an_earlier_store_has_none_and_is_sound(self, tiny_store, tmp_path):
-        path = tiny_store(tmp_path)
-        assert FeatureStore.open(path).golden == ()
-        assert verify(path).sound
-
     def test_a_black_frame_is_kept_too(self, store):
         black = GoldenFrames(0, "p", {"View1": np.zeros((4, 4, 3), np.uint8)})
         build = StoreBuild(store.with_name("copy.zarr"), read_specs(store), "plan")
@@ -88,10 +83,6 @@ class TestDamage:
                 lambda store: (store / "golden/0/View1/c/0/0/0").unlink(),
                 "golden/0/View1/c/0/0/0: no such file",
             ),
-            (
-                lambda store: shutil.rmtree(store / "golden/1"),
-                "golden/1/View1/zarr.json: no such file",
-            ),
             (forge_prompt, "golden/0: golden frames and prompt of VL row 0 do not give the"),
         ],
     )
@@ -121,12 +112,8 @@ class TestOtherStores:
 
     def test_a_damaged_golden_row_of_an_archive_is_named(self, store, tmp_path):
         archive(store, tmp_path / "a.archive.zarr", 1, 1)
-        chunk = tmp_path / "a.archive.zarr/golden/0/View1/c/0/0/0"
-        chunk.write_bytes(b"other")
+        (tmp_path / "a.archive.zarr/golden/0/View1/c/0/0/0").write_bytes(b"other")
         with pytest.raises(StoreIncomplete, match=r"archive is damaged: .*golden frame"):
-            restore(tmp_path / "a.archive.zarr", tmp_path / "back.zarr", 1)
-        chunk.unlink()
-        with pytest.raises(StoreIncomplete, match="no such file"):
             restore(tmp_path / "a.archive.zarr", tmp_path / "back.zarr", 1)
         assert not list(tmp_path.glob("back.zarr*/"))
 
@@ -143,14 +130,6 @@ class TestOtherStores:
         after = merged.golden[3]
         assert after.key == before.key
         assert np.array_equal(after.features, before.features)
-
-    def test_a_merge_with_an_earlier_store_takes_those_that_there_are(
-        self, tiny_golden, tiny_store, tmp_path, reseal
-    ):
-        inputs = [tiny_golden(tmp_path, name="a", rows=()), tiny_golden(tmp_path, name="b", seed=3)]
-        merge(inputs, tmp_path / "both.zarr")
-        rows = [entry["row"] for entry in FeatureStore.open(tmp_path / "both.zarr").attrs[GOLDEN]]
-        assert rows == [60, 67]
 
 
 def test_rows_are_spread_over_those_with_the_most_views():

@@ -91,8 +91,10 @@ class TestListing:
         ("harm", "message"),
         [
             (lambda store: (store / "zarr.json").write_text("{"), "cannot be read as JSON"),
-            (lambda store: shutil.rmtree(store / "tick/action"), "action/zarr.json: no such file"),
-            (lambda store: os.truncate(store / "vl/features/c/0/0/0", 99), "found 99"),
+            (
+                lambda store: os.truncate(store / "vl/features/c/0/0/0", 99),
+                "vl/features/c/0/0/0: expected 196,612 bytes, found 99",
+            ),
         ],
     )
     def test_a_damaged_store_is_listed_and_stops_nothing(
@@ -159,7 +161,7 @@ class TestLeftovers:
             remove_leftover(leftover(previous))
         assert previous.exists()
 
-    @pytest.mark.parametrize("state", ["begun", "damaged", "sealed", "kept"])
+    @pytest.mark.parametrize("state", ["damaged", "sealed", "kept"])
     def test_a_removal_that_was_killed_leaves_what_the_next_build_takes(
         self, tiny_store: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, state: str
     ) -> None:
@@ -172,7 +174,6 @@ class TestLeftovers:
             place = store.rename(part_path(store))
         else:
             place = unfinish(store, 0)
-        if state == "damaged":
             (place / "zarr.json").write_text("{")
 
         def killed(path: Path) -> None:

@@ -392,12 +392,15 @@ class TestLock:
             assert "has no locks" in capsys.readouterr().err
 
 
+any_array = given(
+    rows=st.integers(0, 10**8),
+    width=st.integers(1, 200_000),
+    dtype=st.sampled_from(["u1", "f2", "f4", "f8"]),
+)
+
+
 class TestChunkRule:
-    @given(
-        rows=st.integers(0, 10**8),
-        width=st.integers(1, 200_000),
-        dtype=st.sampled_from(["u1", "f2", "f4", "f8"]),
-    )
+    @any_array
     def test_chunks_of_features_are_whole_pages_and_never_huge(self, rows, width, dtype):
         spec = ArraySpec("vl/features", (rows, 16, width), np.dtype(dtype))
         assert spec.chunk_bytes % 4096 == 0
@@ -411,11 +414,7 @@ class TestChunkRule:
                 shape = (rows, slots, packed_size(kind, dim))
                 assert ArraySpec("vl/features", shape, np.dtype(held)).chunk_bytes <= 110e6
 
-    @given(
-        rows=st.integers(0, 10**8),
-        width=st.integers(1, 200_000),
-        dtype=st.sampled_from(["u1", "f2", "f4", "f8"]),
-    )
+    @any_array
     def test_chunks_are_multiples_of_4096_rows_of_about_64_mb(self, rows, width, dtype):
         spec = ArraySpec("x", (rows, width), np.dtype(dtype))
         assert spec.chunk_rows % 4096 == 0

@@ -4,36 +4,27 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 import zarr
 
 from pipeline.base.config import TrainHeadParams
 from pipeline.store import FeatureStore
 from pipeline.store.chunks import write_seal
-from pipeline.train.batches import BatchIndices
 from pipeline.train.loop import Trainer
 from pipeline.train.run import open_run
 from pipeline.train.split import split_by_episode
 
-KINDS = ("plain", "bfloat16", "variants", "no sensor", "no state")
 SMALL: dict[str, Any] = {
     "sensor_encoder": {"channels": [8, 8], "layers": 1, "heads": 2, "output_dim": 8},
     "state_encoder": {"dim": 8, "layers": 1, "heads": 2, "output_dim": 8},
     "expert": {"dim": 16, "layers": 1, "heads": 2, "dropout": 0.1},
     "horizon": 3,
-    "sensor_window": 6,
-    "state_window": 5,
-    "sensor_window_s": 0.075,
-    "state_window_s": 0.125,
-    "batch_size": 8,
     "max_steps": 20,
     "warmup_steps": 4,
     "lr": 3e-3,
     "ema_decay": 0.9,
     "eval_every": 8,
     "checkpoint_every": 5,
-    "device": "cpu",
     "mixture": {"left": 1.0, "right": 2.0},
 }
 
@@ -44,12 +35,27 @@ def store(tiny_store, tmp_path_factory):
 
 
 @pytest.fixture(scope="session")
-def params_below():
+def store_saying(tiny_store):
+    """`store_saying(folder, entries, key=value, ...)`: a tiny store with these entries in sections
+    of its attributes."""
+
+    def make(folder: Path, entries: dict[str, dict[str, Any]], **changed: Any) -> FeatureStore:
+        path = tiny_store(folder, **changed)
+        attrs = zarr.open_group(path, mode="r+").attrs
+        known: dict[str, Any] = attrs.asdict()
+        attrs.update({section: known.get(section, {}) | more for section, more in entries.items()})
+        write_seal(path)
+        return FeatureStore.open(path)
+
+    return make
+
+
+@pytest.fixture(scope="session")
+def params_below(tiny_head):
     """`params_below(folder, key=value, ...)`: small params that work below this folder."""
 
     def make(folder: Path, **changed: Any) -> TrainHeadParams:
-        places = {"output": folder / "head", "logs": folder / "logs"}
-        return TrainHeadParams.model_validate(SMALL | places | changed)
+        return TrainHeadParams.model_validate(tiny_head(folder, **SMALL | changed))
 
     return make
 
@@ -100,36 +106,3 @@ def stop_at(monkeypatch):
                 trainer.fit()
 
     return stop
-
-
-@pytest.fixture(scope="session", params=KINDS)
-def any_store(request, tiny_store, tmp_path_factory):
-    """Small stores that differ in what they hold, some rows of two variants among them."""
-    folder, kind = tmp_path_factory.mktemp("kinds"), request.param
-    changed = {
-        "bfloat16": {"dtype": "bfloat16"},
-        "variants": {"slots": 6},
-        "no sensor": {"sensor_channels": 0},
-        "no state": {"state_dim": 0},
-    }
-    path = tiny_store(folder, **changed.get(kind, {}))
-    if kind == "variants":
-        attrs = zarr.open_group(path, mode="r+").attrs
-        spec = attrs.asdict()["feature_spec"]
-        attrs["feature_spec"] = {**spec, "variants": 2}
-        write_seal(path)
-    return FeatureStore.open(path)
-
-
-@pytest.fixture(scope="session")
-def draw_plan():
-    """`draw_plan(store, batches, size=7)`: random ticks of random variants."""
-
-    def make(store: FeatureStore, batches: int, size: int = 7) -> list[BatchIndices]:
-        rng = np.random.default_rng(0)
-        return [
-            BatchIndices(rng.integers(0, store.ticks, size), rng.integers(0, store.variants, size))
-            for _ in range(batches)
-        ]
-
-    return make

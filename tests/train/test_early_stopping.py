@@ -21,30 +21,16 @@ def test_it_counts_since_the_best():
 
 
 def test_stopping_early_needs_something_held_out(store, params, trainer):
-    with pytest.raises(ConfigError, match="early_stopping is 3, but nothing is held out") as caught:
+    with pytest.raises(ConfigError, match=r"early_stopping is 3, .*train_head\.split\.val is 0"):
         trainer(store, params(early_stopping=3, split={"val": 0}))
-    assert "train_head.split.val is 0. Set it above 0" in str(caught.value)
-    assert not params().output.with_name("head.part").exists()
-
-
-@pytest.fixture
-def errors(monkeypatch):
-    """What evaluations find, by step; the best is at step 4."""
-    found = {2: 0.9, 4: 0.5, 6: 0.8, 8: 0.6, 10: 0.7, 12: 0.1}
-    monkeypatch.setattr(
-        Trainer,
-        "_measure",
-        lambda self, log: (
-            log.write(self.step, {"val/error": found[self.step]}) or {"val/error": found[self.step]}
-        ),
-    )
-    return found
 
 
 @pytest.mark.parametrize("stopped", [7, None])
 def test_it_stops_early_also_when_it_was_interrupted(
-    store, params, trainer, errors, stop_at, capsys, stopped
+    store, params, trainer, monkeypatch, stop_at, capsys, stopped
 ):
+    errors = {2: 0.9, 4: 0.5, 6: 0.8, 8: 0.6, 10: 0.7, 12: 0.1}  # by step
+    monkeypatch.setattr(Trainer, "_measure", lambda self, log: {"val/error": errors[self.step]})
     chosen = params(early_stopping=3, eval_every=2, checkpoint_every=1, max_steps=100)
     stop_at(trainer(store, chosen), stopped)
     done = trainer(store, chosen)

@@ -2,7 +2,7 @@
 
 import os
 import signal
-import threading
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
@@ -22,14 +22,10 @@ def test_the_first_signal_is_noted_and_the_second_stops_at_once(number):
 
 
 def test_outside_the_main_thread_nothing_changes():
-    seen: list[object] = []
-
-    def work() -> None:
+    def work() -> tuple[bool, bool]:
         before = signal.getsignal(signal.SIGINT)
         with deferred_interrupt() as interrupted:
-            seen.append((interrupted(), signal.getsignal(signal.SIGINT) is before))
+            return interrupted(), signal.getsignal(signal.SIGINT) is before
 
-    thread = threading.Thread(target=work)
-    thread.start()
-    thread.join()
-    assert seen == [(False, True)]
+    with ThreadPoolExecutor(1) as thread:
+        assert thread.submit(work).result() == (False, True)

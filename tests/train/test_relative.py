@@ -4,36 +4,29 @@ import shutil
 
 import numpy as np
 import pytest
-import zarr
 
 from pipeline.base.errors import ConfigError
 from pipeline.policy.checkpoint import find_policy, load_policy
 from pipeline.store import FeatureStore
-from pipeline.store.chunks import write_seal
 from pipeline.train.split import split_by_episode
 
 NAMES = ["joint_0", "joint_1", "joint_2", "joint_3", "gripper"]
 
 
 @pytest.fixture(scope="module")
-def absolute(tiny_store, reseal, tmp_path_factory):
+def absolute(store_saying, reseal, tmp_path_factory):
     """The tiny store with targets of joints that lie near where the joints are, far from zero."""
-    path = tiny_store(tmp_path_factory.mktemp("absolute"))
-    store = FeatureStore.open(path)
-    file = path / "tick/action/c/0/0"
-    action = np.memmap(file, np.float32, "r+", shape=(store.ticks, 5))
+    joints = {"names": NAMES, "units": [""] * 5, "kind": "absolute"}
+    store = store_saying(tmp_path_factory.mktemp("absolute"), {"streams": {"action": joints}})
+    path = store.path
+    action = np.memmap(path / "tick/action/c/0/0", np.float32, "r+", shape=(store.ticks, 5))
     values = path / "state/values/c/0/0"
     state = np.memmap(values, np.float32, "r+", shape=store.array("state/values").shape)
     state *= 100  # a joint is anywhere, and its targets are close to it
     action[:, :4] = state[store.array("tick/state_end") - 1] + 0.1 * action[:, :4]
     action.flush()
     state.flush()
-    attributes = zarr.open_group(path, mode="r+").attrs
-    streams = dict(attributes["streams"])
-    streams["action"] = {"names": NAMES, "units": [""] * 5, "kind": "absolute"}
-    attributes.update({"streams": streams})
     reseal(path)
-    write_seal(path)
     return FeatureStore.open(path)
 
 
@@ -64,23 +57,20 @@ def test_statistics_of_the_recorded_actions_stay(absolute, params, trainer, tmp_
 def test_a_joint_that_stands_elsewhere_in_val_does_not_choose_the_checkpoint(
     absolute, params, trainer, reseal, tmp_path
 ):
-    path = tmp_path / "still.zarr"
-    shutil.copytree(absolute.path, path)
+    path = shutil.copytree(absolute.path, tmp_path / "still.zarr")
     val = split_by_episode(absolute, params().split, params().horizon).val
     action = np.memmap(path / "tick/action/c/0/0", np.float32, "r+", shape=(absolute.ticks, 5))
     action[:, 3] = 0.05 + 1e-6 * np.random.default_rng(0).standard_normal(absolute.ticks)
     action[val, 3] = -0.09
     action.flush()
     reseal(path)
-    write_seal(path)
     done = trainer(FeatureStore.open(path), params())
     done.fit()
     assert done.stopping.best_error < 10
 
 
 def test_a_tick_without_a_state_is_named(absolute, params, trainer, reseal, tmp_path):
-    path = tmp_path / "holes.zarr"
-    shutil.copytree(absolute.path, path)
+    path = shutil.copytree(absolute.path, tmp_path / "holes.zarr")
     ends = np.memmap(path / "tick/state_end/c/0", np.int64, "r+", shape=(absolute.ticks,))
     ends[:30] = 0  # of the first episode
     ends.flush()

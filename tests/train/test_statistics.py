@@ -1,16 +1,15 @@
 """The normalisation sees what training may see, once, and nothing else."""
 
+import re
 from dataclasses import asdict
 
 import numpy as np
 import pytest
-import zarr
 
 from pipeline.base.config import TrainHeadParams
 from pipeline.base.errors import NumericsError
 from pipeline.policy.attention import right_aligned
 from pipeline.store import FeatureStore
-from pipeline.store.chunks import write_seal
 from pipeline.store.gather import Batch, Gatherer, Selection
 from pipeline.train.batches import Windows
 from pipeline.train.statistics import anchored_channels, fit_normalization
@@ -18,9 +17,8 @@ from pipeline.train.statistics import anchored_channels, fit_normalization
 WINDOWS = Windows(8, 65, 100, 0.1, 1.0)
 
 
-@pytest.mark.parametrize("chunk_bytes", [500, 2**26])
-def test_statistics_are_those_of_the_training_ticks(store, monkeypatch, chunk_bytes):
-    monkeypatch.setattr("pipeline.train.statistics.CHUNK_BYTES", chunk_bytes)
+def test_statistics_are_those_of_the_training_ticks(store, monkeypatch):
+    monkeypatch.setattr("pipeline.train.statistics.CHUNK_BYTES", 500)
     # All of episode 1, and of episode 4 the first 7 ticks: a tail is held out.
     ticks = np.concatenate([np.arange(30, 60), np.arange(120, 127)])
     found = fit_normalization(store, ticks, WINDOWS)
@@ -58,14 +56,9 @@ def test_batches_of_states_read_no_features(store, monkeypatch):
 
 
 @pytest.mark.parametrize("chunk_bytes", [1, 2**26])
-def test_features_are_counted_over_all_variants(tiny_store, tmp_path, monkeypatch, chunk_bytes):
+def test_features_are_counted_over_all_variants(store_saying, tmp_path, monkeypatch, chunk_bytes):
     monkeypatch.setattr("pipeline.train.statistics.CHUNK_BYTES", chunk_bytes)
-    path = tiny_store(tmp_path, slots=6)
-    attrs = zarr.open_group(path, mode="r+").attrs
-    spec = attrs.asdict()["feature_spec"]
-    attrs["feature_spec"] = {**spec, "variants": 3}
-    write_seal(path)
-    store = FeatureStore.open(path)
+    store = store_saying(tmp_path, {"feature_spec": {"variants": 3}}, slots=6)
     store.array("vl/slot_valid")[10:13, [1, 3, 5]] = 0
     found = fit_normalization(store, np.arange(30, 60), WINDOWS).features
     assert found is not None
@@ -110,25 +103,18 @@ def test_absent_streams_have_none_and_bfloat16_is_read(tiny_store, tmp_path):
 def test_a_number_that_is_none_is_named_by_episode_and_time(tiny_store, tmp_path, array, row, said):
     store = FeatureStore.open(tiny_store(tmp_path))
     store.array(array)[row] = np.nan
-    with pytest.raises(NumericsError) as caught:
+    with pytest.raises(NumericsError, match=re.escape(f"found nan at {said}")):
         fit_normalization(store, np.arange(30, 60), WINDOWS)
-    assert said in str(caught.value)
-    assert "found nan" in str(caught.value)
 
 
-@pytest.mark.parametrize("chunk_bytes", [300, 2**26])
-def test_threads_change_no_bit(tiny_store, tmp_path, monkeypatch, chunk_bytes):
-    monkeypatch.setattr("pipeline.train.statistics.CHUNK_BYTES", chunk_bytes)
+def test_threads_change_no_bit(tiny_store, tmp_path, monkeypatch):
+    monkeypatch.setattr("pipeline.train.statistics.CHUNK_BYTES", 300)
     monkeypatch.setattr("pipeline.policy.normalization._PIECE_VALUES", 40)
     store = FeatureStore.open(tiny_store(tmp_path))
     store.array("vl/slot_valid")[12, 1] = 0
     ticks = np.arange(20, 160)
     alone = fit_normalization(store, ticks, WINDOWS, threads=1).document()
     assert fit_normalization(store, ticks, WINDOWS, threads=3).document() == alone
-
-    store.array("state/values")[121, 0] = np.inf
-    with pytest.raises(NumericsError, match=r"episode_001, state reading 1 \(at 0.025 s\)"):
-        fit_normalization(store, ticks, WINDOWS, threads=3)
 
 
 @pytest.mark.parametrize(
@@ -156,8 +142,7 @@ def test_anchored_are_translations_that_go_either_way(
 
 
 def test_what_rested_in_training_is_no_unit_of_what_moves_later(tiny_store, tmp_path):
-    path = tiny_store(tmp_path)
-    store = FeatureStore.open(path)
+    store = FeatureStore.open(tiny_store(tmp_path))
     readings = store.array("state/values")
     readings[:, 1] = readings[:, 1] * 1e-4  # its likes move as before
     fitted = fit_normalization(store, np.arange(30, 60), WINDOWS).state
@@ -165,15 +150,11 @@ def test_what_rested_in_training_is_no_unit_of_what_moves_later(tiny_store, tmp_
     assert fitted.std[1] == pytest.approx(0.05 * np.sort(fitted.std)[-2:].min(), rel=0.5)
 
 
-def test_angles_are_fitted_as_a_policy_takes_them(tiny_store, tmp_path):
-    path = tiny_store(tmp_path)
-    streams = dict(zarr.open_group(path, mode="r").attrs["streams"])
-    streams["state"] |= {"units": ["deg"] * len(streams["state"]["names"])}
-    zarr.open_group(path, mode="r+").attrs["streams"] = streams
-    write_seal(path)
-    store = FeatureStore.open(path)
-    store.array("state/values")[:, 0] += 360.0 * np.arange(len(store.array("state/values")))
-    fitted = fit_normalization(store, np.arange(30, 60), WINDOWS).state
+def test_angles_are_fitted_as_a_policy_takes_them(store, store_saying, tmp_path):
+    state = store.streams["state"] | {"units": ["deg"] * store.state_dim}
+    turned = store_saying(tmp_path, {"streams": {"state": state}})
+    turned.array("state/values")[:, 0] += 360.0 * np.arange(len(turned.array("state/values")))
+    fitted = fit_normalization(turned, np.arange(30, 60), WINDOWS).state
     assert fitted is not None
     assert fitted.mean.shape == (2 * store.state_dim,)
     assert (np.abs(fitted.mean) <= 1).all()

@@ -1,11 +1,9 @@
 """Episodes that a store's model was tuned or chosen on do not judge policies on top of it."""
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
-import zarr
 
 from pipeline.base.config import SplitParams
 from pipeline.base.errors import CheckpointIncomplete, ConfigError
@@ -21,7 +19,6 @@ from pipeline.base.provenance import (
     write_tuned_on,
 )
 from pipeline.store import FeatureStore
-from pipeline.store.chunks import write_seal
 from pipeline.train.split import Split, split_by_episode
 from pipeline.train.training_data import refuse_tuned_episodes
 
@@ -32,16 +29,12 @@ def part(number: int, ticks: tuple[int, int] = (0, 30), content: str | None = No
 
 
 @pytest.fixture
-def tuned_store(tiny_store, tmp_path):
+def tuned_store(store_saying, tmp_path):
     """`tuned_store(tuned, episodes=6)`: a store whose adapter says that, or nothing for None."""
 
     def make(tuned: TunedOn | None, episodes: int = 6) -> FeatureStore:
-        path = tiny_store(tmp_path, episodes=episodes)
-        attrs: Any = zarr.open_group(path, mode="r+").attrs
-        spec = attrs["feature_spec"] | {"adapter": "a digest"}
-        attrs.update({"feature_spec": spec, **tuned_on_attributes(tuned)})
-        write_seal(path)
-        return FeatureStore.open(path)
+        entries = {"feature_spec": {"adapter": "a digest"}, **tuned_on_attributes(tuned)}
+        return store_saying(tmp_path, entries, episodes=episodes)
 
     return make
 

@@ -1,6 +1,7 @@
 """What the tests of the frozen model share."""
 
 import hashlib
+import shutil
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,6 +23,12 @@ class Extractor:
     spec: FeatureSpec
     preparer: Preparer
     model: FrozenVLM
+
+
+@pytest.fixture
+def copy(demo_checkpoint, tmp_path):
+    """The folder of the demo's checkpoint, to be changed by a test."""
+    return shutil.copytree(demo_checkpoint, tmp_path / "copy")
 
 
 @pytest.fixture(scope="session")

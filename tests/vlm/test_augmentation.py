@@ -120,21 +120,17 @@ def test_no_size_or_draw_shows_what_the_frame_has_not(height, width, angle, side
     assert np.array_equal(found, frame), "beyond its edge the frame is mirrored, not black"
 
 
-class TestPreparer:
-    @pytest.fixture
-    def frames(self, make_frame):
-        return {view: make_frame(seed) for seed, view in enumerate(("View1", "View2"))}
-
-    def test_variant_0_is_the_plain_row_and_all_have_its_layout(self, extractor, frames):
-        ours = extractor(variants=3)
-        key = ours.spec.row_key("prompt", frames)
-        rows = ours.preparer.prepare_variants("go", frames, key)
-        plain = extractor().preparer.prepare("go", frames)
-        assert len(rows) == 3
-        assert np.array_equal(rows[0].pixels, plain.pixels)
-        assert {row.layout for row in rows} == {plain.layout}
-        for a, b in ((0, 1), (0, 2), (1, 2)):
-            for view in range(2):
-                assert (rows[a].pixels[view] != rows[b].pixels[view]).mean() > 0.5
-        (only,) = extractor().preparer.prepare_variants("go", frames, KEY)
-        assert np.array_equal(only.pixels, plain.pixels)
+def test_variant_0_is_the_plain_row_and_all_have_its_layout(extractor, make_frame):
+    ours = extractor(variants=3)
+    frames = {"View1": make_frame(0), "View2": make_frame(1)}
+    key = ours.spec.row_key("prompt", frames)
+    rows = ours.preparer.prepare_variants("go", frames, key)
+    plain = extractor().preparer.prepare("go", frames)
+    assert len(rows) == 3
+    assert np.array_equal(rows[0].pixels, plain.pixels)
+    assert {row.layout for row in rows} == {plain.layout}
+    for a, b in ((0, 1), (0, 2), (1, 2)):
+        for view in range(2):
+            assert (rows[a].pixels[view] != rows[b].pixels[view]).mean() > 0.5
+    (only,) = extractor().preparer.prepare_variants("go", frames, KEY)
+    assert np.array_equal(only.pixels, plain.pixels)

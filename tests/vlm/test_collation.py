@@ -17,6 +17,7 @@ from pipeline.vlm.collation import Collator, unique
 from pipeline.vlm.feature_spec import feature_spec
 from pipeline.vlm.preparation import Preparer
 from pipeline.vlm.qwen import FrozenVLM
+from pipeline.vlm.vision import VisionTower
 
 
 @given(st.lists(arrays(np.uint8, (2, 3, 3), elements=st.integers(0, 1)), max_size=12))
@@ -37,23 +38,15 @@ def test_images_that_differ_where_nobody_looks_are_told_apart():
     assert which == [0, 1, 0]
 
 
-@pytest.fixture
-def seen(monkeypatch):
-    """How many images each pass of the tower sees."""
-    from pipeline.vlm.vision import VisionTower
-
-    counts: list[int] = []
+def test_equal_images_of_a_batch_are_seen_once(extractor, make_frame, monkeypatch):
+    seen: list[int] = []  # images in each pass of the tower
     real = VisionTower.plan
 
     def plan(self, images, device):
-        counts.append(images)
+        seen.append(images)
         return real(self, images, device)
 
     monkeypatch.setattr(VisionTower, "plan", plan)
-    return counts
-
-
-def test_equal_images_of_a_batch_are_seen_once(extractor, make_frame, seen):
     ours = extractor(pooling=["mean", "view_mean"])
     a, b, c = (make_frame(seed) for seed in range(3))
     rows = [

@@ -10,11 +10,9 @@ from safetensors.torch import load_file, save_file
 from pipeline.base.differences import differences
 from pipeline.base.errors import VLMError
 from pipeline.vlm.checkpoint_folder import resolve_checkpoint, weight_files
-from pipeline.vlm.feature_spec import (
-    feature_shape,
-    feature_spec,
-)
+from pipeline.vlm.feature_spec import feature_shape, feature_spec
 from pipeline.vlm.slots import Slot
+from tests.vlm.documents import edit
 
 VIEWS = ("View1", "View2", "View3")
 
@@ -121,12 +119,11 @@ def test_digest_and_keys_move_with_each_param_and_with_the_code(spec_of, monkeyp
     assert all(differences(specs[0].attrs(), spec.attrs()) for spec in specs[1:])
 
 
-def test_digest_stays_where_features_do(spec_of, demo_checkpoint, tmp_path):
-    moved = shutil.copytree(demo_checkpoint, tmp_path / "moved")
-    (moved / "README.md").write_text("not read by the model")
+def test_digest_stays_where_features_do(spec_of, copy):
+    (copy / "README.md").write_text("not read by the model")
     base = spec_of()
     assert spec_of(attention="eager") == base
-    assert spec_of(checkpoint=str(moved)) == base
+    assert spec_of(checkpoint=str(copy)) == base
     assert spec_of(layers=[3]) == spec_of(layers=[-1]) == base
     assert differences(base.attrs(), spec_of(attention="eager").attrs()) == {}
 
@@ -139,11 +136,7 @@ def _touch_weight(folder):
 
 
 def _edit(name, **changes):
-    def edit(folder):
-        path = folder / name
-        path.write_text(json.dumps(json.loads(path.read_text()) | changes))
-
-    return edit
+    return lambda folder: edit(folder / name, changes)
 
 
 def _rename_token(folder):
@@ -157,10 +150,7 @@ FILES = [
     (_edit("preprocessor_config.json", image_mean=[0.5, 0.5, 0.5]), "processor.image_mean"),
     (_edit("preprocessor_config.json", max_pixels=12000), "processor.image_size"),
     (_rename_token, "tokenizer"),
-    (
-        _edit("tokenizer_config.json", chat_template="{{ '<|image_pad|>' * 3 }}"),
-        "chat_template",
-    ),
+    (_edit("tokenizer_config.json", chat_template="{{ '<|image_pad|>' * 3 }}"), "chat_template"),
 ]
 
 
@@ -216,11 +206,8 @@ def test_a_hub_id_that_is_not_there_says_what_to_run(monkeypatch, tmp_path):
     monkeypatch.setattr("huggingface_hub.constants.HF_HUB_OFFLINE", True)
     monkeypatch.setattr("huggingface_hub.constants.HF_HUB_CACHE", str(tmp_path))
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(VLMError, match=r"stages\.demo.*hf download models/demo_vlm") as refused:
+    with pytest.raises(VLMError, match=r"stages\.demo.*hf download models/demo_vlm"):
         resolve_checkpoint("models/demo_vlm")
-    said = str(refused.value)
-    assert "no folder of that name here; and as a hub id, it cannot be downloaded" in said
-    assert "Error" not in said and "stages.doctor" in said
 
 
 def test_a_cached_hub_copy_is_used_without_network(monkeypatch, tmp_path, demo_checkpoint):
@@ -237,25 +224,22 @@ def test_a_cached_hub_copy_is_used_without_network(monkeypatch, tmp_path, demo_c
         weight_files(resolve_checkpoint("someone/small-vl"))
 
 
-def test_only_what_transformers_loads_is_digested(tmp_path, demo_checkpoint):
-    folder = tmp_path / "vlm"
-    shutil.copytree(demo_checkpoint, folder)
-    whole, shard = folder / "model.safetensors", folder / "model-00001-of-00001.safetensors"
-    index = folder / "model.safetensors.index.json"
+def test_only_what_transformers_loads_is_digested(copy):
+    whole, shard = copy / "model.safetensors", copy / "model-00001-of-00001.safetensors"
+    index = copy / "model.safetensors.index.json"
     shutil.copy(whole, shard)
     index.write_text(json.dumps({"metadata": {}, "weight_map": {"a": shard.name}}))
-    assert weight_files(folder) == [folder / "config.json", whole]
+    assert weight_files(copy) == [copy / "config.json", whole]
     whole.unlink()
-    assert weight_files(folder) == sorted([folder / "config.json", shard, index])
-    (folder / "adapter_config.json").write_text("{}")
+    assert weight_files(copy) == sorted([copy / "config.json", shard, index])
+    (copy / "adapter_config.json").write_text("{}")
     with pytest.raises(VLMError, match=r"adapter_config\.json.*name that as vlm\.adapter"):
-        weight_files(folder)
+        weight_files(copy)
 
 
 def test_what_transformers_read_is_remembered_by_all_it_depends_on(
-    vlm_params, digest_file, demo_checkpoint, tmp_path, monkeypatch
+    vlm_params, digest_file, copy, monkeypatch
 ):
-    folder = shutil.copytree(demo_checkpoint, tmp_path / "checkpoint")
     kept: dict[str, str] = {}
     made: list[str] = []
 
@@ -266,7 +250,7 @@ def test_what_transformers_read_is_remembered_by_all_it_depends_on(
         return kept[what]
 
     def spec(views=VIEWS, **changes):
-        vlm = vlm_params(checkpoint=str(folder), **changes)
+        vlm = vlm_params(checkpoint=str(copy), **changes)
         again = feature_spec(vlm, "float32", views, digest_file, remember)
         fresh = feature_spec(vlm, "float32", views, digest_file)
         assert again == fresh
@@ -278,7 +262,7 @@ def test_what_transformers_read_is_remembered_by_all_it_depends_on(
     spec(prompt="{images}")
     spec(image_resize_height=168)
     spec(views=("View1",))
-    (folder / "another.txt").write_text("")
+    (copy / "another.txt").write_text("")
     spec()
     monkeypatch.setattr("pipeline.vlm.feature_spec.version", lambda name: "another")
     spec()

@@ -1,8 +1,7 @@
 """The live model gives the frozen one's features, learns what it should, and saves it."""
 
-import copy
 import json
-import shutil
+from copy import deepcopy
 from typing import Any
 
 import pytest
@@ -203,11 +202,10 @@ def test_full_saves_a_complete_checkpoint(prepare, demo_checkpoint, tmp_path):
         torch.testing.assert_close(one, other)
 
 
-def test_full_keeps_the_dtype_of_its_base(prepare, demo_checkpoint, tmp_path):
-    base = shutil.copytree(demo_checkpoint, tmp_path / "base")
-    model = Qwen2_5_VLForConditionalGeneration.from_pretrained(base, dtype=torch.bfloat16)
-    model.save_pretrained(base)
-    frozen, rows, _ = prepare("bfloat16", dtype="bfloat16", checkpoint=str(base))
+def test_full_keeps_the_dtype_of_its_base(prepare, copy, tmp_path):
+    model = Qwen2_5_VLForConditionalGeneration.from_pretrained(copy, dtype=torch.bfloat16)
+    model.save_pretrained(copy)
+    frozen, rows, _ = prepare("bfloat16", dtype="bfloat16", checkpoint=str(copy))
     live = _live(frozen, method="full")
     _stir(live)
     live.save(tmp_path / "tuned")
@@ -223,7 +221,7 @@ def test_a_copy_shares_what_is_frozen(prepare, method):
     frozen, rows, _ = prepare()
     live = _live(frozen, method=method).eval()
     memo = {id(p): p for p in live.parameters() if not p.requires_grad}
-    twin = copy.deepcopy(live, memo)
+    twin = deepcopy(live, memo)
     pairs = zip(live.named_parameters(), twin.named_parameters(), strict=True)
     for (name, mine), (its_name, its) in pairs:
         assert name == its_name

@@ -12,13 +12,6 @@ from pipeline.vlm.processor import PixelSettings, stretch
 from pipeline.vlm.qwen import patchify
 
 
-def test_the_seeds_resize_gives_364_by_644(demo_checkpoint):
-    settings = PixelSettings.read(demo_checkpoint, (360, 640))
-    assert settings.image_size == (364, 644)
-    assert settings.grid == (26, 46)
-    assert settings.merged_grid == (13, 23)
-
-
 def test_patches_equal_the_image_processor(demo_checkpoint, make_frame):
     frames = [make_frame(seed, 360, 640) for seed in range(2)]
     settings = PixelSettings.read(demo_checkpoint, (360, 640))

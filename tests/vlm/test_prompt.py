@@ -1,7 +1,6 @@
 """Prompts are one user turn of the checkpoint's chat template."""
 
 import json
-import shutil
 from typing import Any
 
 import pytest
@@ -9,6 +8,7 @@ from transformers import AutoTokenizer
 
 from pipeline.base.errors import VLMError
 from pipeline.vlm.processor import PromptRenderer
+from tests.vlm.documents import edit
 
 SYSTEM = "<|im_start|>system\nYou are a helpful assistant.<|im_end|>\n"
 IMAGE = "<|vision_start|><|image_pad|><|vision_end|>"
@@ -20,7 +20,6 @@ IMAGE = "<|vision_start|><|image_pad|><|vision_end|>"
         ("{instruction}\n{images}\n{instruction}", 2, f"go\n{IMAGE * 2}\ngo"),
         ("{instruction}\n{images}\n{instruction}", 0, "go\n\ngo"),
         ("Task: {instruction}.", 3, f"Task: go.{IMAGE * 3}"),
-        ("{images}{instruction}", 1, f"{IMAGE}go"),
     ],
 )
 def test_rendering(demo_checkpoint, template, images, user):
@@ -69,19 +68,9 @@ def test_tokens_are_the_tokenizers_with_one_placeholder_a_merged_patch(
     assert row.prompt == preparer.render("insert the needle", ["View3", "View1"])
 
 
-@pytest.fixture
-def copy(demo_checkpoint, tmp_path):
-    return shutil.copytree(demo_checkpoint, tmp_path / "copy")
-
-
-def _edit(path, **changes):
-    document = json.loads(path.read_text()) | changes
-    path.write_text(json.dumps({key: v for key, v in document.items() if v is not None}))
-
-
 def test_chat_template_in_a_file_of_its_own(demo_checkpoint, copy):
     inside = PromptRenderer(demo_checkpoint, "{instruction}")
-    _edit(copy / "tokenizer_config.json", chat_template=None)
+    edit(copy / "tokenizer_config.json", {"chat_template": None})
     with pytest.raises(VLMError, match="no chat template"):
         PromptRenderer(copy, "{instruction}")
     for name, content in (
@@ -94,13 +83,13 @@ def test_chat_template_in_a_file_of_its_own(demo_checkpoint, copy):
 
 
 def test_a_template_that_drops_images_is_refused(copy):
-    _edit(copy / "tokenizer_config.json", chat_template="{{ messages[0]['role'] }}")
+    edit(copy / "tokenizer_config.json", {"chat_template": "{{ messages[0]['role'] }}"})
     with pytest.raises(VLMError, match="renders 0 of 2 images"):
         PromptRenderer(copy, "{instruction}").render("go", 2)
 
 
 def test_another_checkpoints_tokenizer_is_refused(copy):
-    _edit(copy / "config.json", image_token_id=5)
+    edit(copy / "config.json", {"image_token_id": 5})
     with pytest.raises(VLMError, match="image_token_id 5"):
         PromptRenderer(copy, "{instruction}")
     (copy / "tokenizer.json").unlink()

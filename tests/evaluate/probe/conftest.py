@@ -26,89 +26,67 @@ def store(_written: Path) -> FeatureStore:
     return FeatureStore.open(_written)
 
 
-@pytest.fixture
-def renamed() -> Callable[..., FeatureStore]:
-    """`renamed(path, slots, **spec)`: the store with its slots named so, its spec changed so."""
-
-    def rename(path: Path, slots: list[dict[str, Any]], **spec: Any) -> FeatureStore:
-        attrs = zarr.open_group(path, mode="r+").attrs
-        attrs["slots"] = slots
-        attrs["feature_spec"] = {**dict(attrs["feature_spec"]), **spec}
-        write_seal(path)
-        return FeatureStore.open(path)
-
-    return rename
+def renamed(path: Path, slots: list[dict[str, Any]], **spec: Any) -> FeatureStore:
+    """The store of this path with its slots named so, its spec changed so."""
+    attrs = zarr.open_group(path, mode="r+").attrs
+    attrs["slots"] = slots
+    attrs["feature_spec"] = {**dict(attrs["feature_spec"]), **spec}
+    write_seal(path)
+    return FeatureStore.open(path)
 
 
-@pytest.fixture
-def limited() -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
-    """`limited(x, fold)`: inputs as they are read, each column by the formula itself.
+def limited(x: np.ndarray, fold: np.ndarray) -> np.ndarray:
+    """Inputs as they are read, each column by the formula itself; `fold` is (repeat, row)."""
+    inputs = np.zeros(x.shape)
+    for column in range(x.shape[1]):
+        values = x[:, column]
+        trained = [values[deal != held] for deal in fold for held in np.unique(deal)]
+        if min(rows.std() for rows in trained) <= STILL * values.std():
+            continue
+        lower = max(rows.mean() - LIMIT * rows.std() for rows in trained)
+        upper = min(rows.mean() + LIMIT * rows.std() for rows in trained)
+        if upper > lower:
+            kept = np.clip(values, lower, upper)
+            inputs[:, column] = (kept - kept.mean()) / kept.std()
+    return inputs
 
-    `fold` is (repeat, row).
+
+def predicted(x: np.ndarray, y: np.ndarray, other: np.ndarray, ridge: np.ndarray) -> np.ndarray:
+    """By scikit-learn's Ridge, which has one penalty for all columns, so they are scaled."""
+    scale = 1 / np.sqrt(ridge)
+    return Ridge(alpha=len(x)).fit(x * scale, y).predict(other * scale)
+
+
+def nested(
+    x: np.ndarray,
+    y: np.ndarray,
+    fold: np.ndarray,
+    penalties: tuple[float, ...],
+    known: int = 0,
+    of_known: tuple[float, ...] = (),
+) -> tuple[np.ndarray, np.ndarray]:
+    """(fold, target) R^2 and the chosen penalties of one deal, on the rows themselves.
+
+    `known` is the number of last columns that have the penalties `of_known` (fold,) instead.
     """
-
-    def limit(x: np.ndarray, fold: np.ndarray) -> np.ndarray:
-        inputs = np.zeros(x.shape)
-        for column in range(x.shape[1]):
-            values = x[:, column]
-            trained = [values[deal != held] for deal in fold for held in np.unique(deal)]
-            if min(rows.std() for rows in trained) <= STILL * values.std():
-                continue
-            lower = max(rows.mean() - LIMIT * rows.std() for rows in trained)
-            upper = min(rows.mean() + LIMIT * rows.std() for rows in trained)
-            if upper > lower:
-                kept = np.clip(values, lower, upper)
-                inputs[:, column] = (kept - kept.mean()) / kept.std()
-        return inputs
-
-    return limit
-
-
-@pytest.fixture
-def nested() -> Callable[..., tuple[np.ndarray, np.ndarray]]:
-    """`nested(x, y, fold, penalties)`: (fold, target) R^2 and the chosen penalties of one deal.
-
-    By scikit-learn's Ridge on the rows themselves. `known` is the number of last columns that have
-    the penalties `of_known` (fold,) instead: Ridge has one for all, so the columns are scaled.
-    """
-
-    def predicted(x: np.ndarray, y: np.ndarray, other: np.ndarray, ridge: np.ndarray) -> np.ndarray:
-        scale = 1 / np.sqrt(ridge)
-        return Ridge(alpha=len(x)).fit(x * scale, y).predict(other * scale)
-
-    def score(
-        x: np.ndarray,
-        y: np.ndarray,
-        fold: np.ndarray,
-        penalties: tuple[float, ...],
-        known: int = 0,
-        of_known: tuple[float, ...] = (),
-    ) -> tuple[np.ndarray, np.ndarray]:
-        held_out = np.unique(fold)
-        r2 = np.empty((len(penalties), len(held_out), y.shape[1]))
-        for at, penalty in enumerate(penalties):
-            for held in held_out:
-                train = fold != held
-                ridge = np.full(x.shape[1], penalty)
-                ridge[x.shape[1] - known :] = of_known[held] if known else 0
-                error = (y[~train] - predicted(x[train], y[train], x[~train], ridge)) ** 2
-                with np.errstate(divide="ignore", invalid="ignore"):
-                    r2[at, held] = 1 - error.mean(0) / y.var(0)
-        chosen = []
+    held_out = np.unique(fold)
+    r2 = np.empty((len(penalties), len(held_out), y.shape[1]))
+    for at, penalty in enumerate(penalties):
         for held in held_out:
-            ticks = np.array([(fold == other).sum() * (other != held) for other in held_out])
-            chosen.append(int(((r2[:, :, y.std(0) > 0].sum(2)) * ticks).sum(1).argmax()))
-        return r2[chosen, held_out], np.array(penalties)[chosen]
+            train = fold != held
+            ridge = np.full(x.shape[1], penalty)
+            ridge[x.shape[1] - known :] = of_known[held] if known else 0
+            error = (y[~train] - predicted(x[train], y[train], x[~train], ridge)) ** 2
+            with np.errstate(divide="ignore", invalid="ignore"):
+                r2[at, held] = 1 - error.mean(0) / y.var(0)
+    chosen = []
+    for held in held_out:
+        ticks = np.array([(fold == other).sum() * (other != held) for other in held_out])
+        chosen.append(int(((r2[:, :, y.std(0) > 0].sum(2)) * ticks).sum(1).argmax()))
+    return r2[chosen, held_out], np.array(penalties)[chosen]
 
-    return score
 
-
-@pytest.fixture
-def r2_by_fold() -> Callable[..., np.ndarray]:
-    """`r2_by_fold(score, folds, repeat=0)`: (fold, target) R^2 of one deal."""
-
-    def by_fold(score: ProbeScore, folds: ProbeFolds, repeat: int = 0) -> np.ndarray:
-        held = folds.deals[repeat] == np.arange(folds.count)[:, None]
-        return 1 - held @ score.losses[repeat] / (held @ score.rows)[:, None]
-
-    return by_fold
+def r2_by_fold(score: ProbeScore, folds: ProbeFolds, repeat: int = 0) -> np.ndarray:
+    """(fold, target) R^2 of one deal."""
+    held = folds.deals[repeat] == np.arange(folds.count)[:, None]
+    return 1 - held @ score.losses[repeat] / (held @ score.rows)[:, None]

@@ -1,22 +1,18 @@
 """State and sensor are summarised from what was known at the tick."""
 
-from collections.abc import Callable
-from pathlib import Path
-
 import numpy as np
 import pytest
 
 from pipeline.base.errors import NumericsError
 from pipeline.evaluate.probe.inputs import LIMIT, STILL, past_actions, reduce, summarize
 from pipeline.store import FeatureStore
+from tests.evaluate.probe.conftest import limited
 
 TICKS = np.arange(0, 180, 7)
 FOLD = np.stack([TICKS // 30 % 3, TICKS // 30 % 2])
 
 
-def test_last_mean_and_spread_of_the_causal_window(
-    store: FeatureStore, limited: Callable[[np.ndarray, np.ndarray], np.ndarray]
-) -> None:
+def test_last_mean_and_spread_of_the_causal_window(store: FeatureStore) -> None:
     values = summarize(store, "sensor", TICKS, FOLD, 20)
     ends = store.array("tick/sensor_end")[TICKS]
     starts = store.array("episode/sensor_start")[TICKS // 30]
@@ -57,9 +53,7 @@ def test_ticks_without_a_reading_say_so(store: FeatureStore) -> None:
     assert np.abs(values[~missing, :15].mean(0)).max() < 1e-5
 
 
-def test_a_force_is_not_lost_beside_a_wide_scan(
-    tiny_store: Callable[..., Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_force_is_not_lost_beside_a_wide_scan(tiny_store, tmp_path, monkeypatch) -> None:
     monkeypatch.setattr("pipeline.evaluate.probe.inputs.STREAM_WIDTH", 2)
     store = FeatureStore.open(tiny_store(tmp_path, sensor_channels=9, state_dim=0))
     store.streams["sensor"]["units"][4] = "N"
@@ -68,12 +62,6 @@ def test_a_force_is_not_lost_beside_a_wide_scan(
     force = store.array("sensor/values")[store.array("tick/sensor_end")[TICKS] - 1, 4]
     correlations = [abs(np.corrcoef(force, column)[0, 1]) for column in values[:, :3].T]
     assert max(correlations) > 0.9999
-
-
-def test_no_stream_is_no_column(tiny_store: Callable[..., Path], tmp_path: Path) -> None:
-    store = FeatureStore.open(tiny_store(tmp_path, sensor_channels=0, state_dim=0))
-    assert summarize(store, "sensor", TICKS, FOLD, 5).shape == (len(TICKS), 0)
-    assert summarize(store, "state", TICKS, FOLD, 5).shape == (len(TICKS), 0)
 
 
 def test_a_reading_that_is_no_number_is_named(store: FeatureStore) -> None:
@@ -96,9 +84,7 @@ def test_main_directions_hold_what_varies() -> None:
 
 
 @pytest.mark.parametrize("width", [5, 3])
-def test_what_moves_where_others_rest_stays_within_limits(
-    width: int, limited: Callable[[np.ndarray, np.ndarray], np.ndarray]
-) -> None:
+def test_what_moves_where_others_rest_stays_within_limits(width: int) -> None:
     """Of five recordings: a joint that moves in one, one that is elsewhere in one, a spike."""
     rng = np.random.default_rng(0)
     fold = np.repeat(np.arange(5), 40)

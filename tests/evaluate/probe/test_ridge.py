@@ -1,9 +1,5 @@
 """Folds hold whole recordings; scores are those of scikit-learn's ridge regression on the rows."""
 
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any
-
 import numpy as np
 import pytest
 
@@ -11,8 +7,7 @@ from pipeline.base.errors import NumericsError, StoreMismatch
 from pipeline.evaluate.figures import Figure
 from pipeline.evaluate.probe.ridge import ProbeFolds, cross_validate, estimate, fold_by_recording
 from pipeline.store import FeatureStore
-
-Make = Callable[..., Any]
+from tests.evaluate.probe.conftest import nested, r2_by_fold
 
 
 def test_each_recording_is_in_one_fold_with_its_other_formats(store: FeatureStore) -> None:
@@ -39,7 +34,7 @@ def test_chunks_end_within_their_episode(store: FeatureStore) -> None:
     assert len(fewer.ticks) == 20 and set(fewer.ticks // 30) == set(range(6))
 
 
-def test_fewer_recordings_and_ticks_are_fewer_folds(tiny_store: Make, tmp_path: Path) -> None:
+def test_fewer_recordings_and_ticks_are_fewer_folds(tiny_store, tmp_path) -> None:
     store = FeatureStore.open(tiny_store(tmp_path, episodes=3))
     folds = fold_by_recording(store, 5, 8)
     assert folds.count == 3 and "3 recordings make 3 folds, not 5" in folds.notes
@@ -51,9 +46,7 @@ def test_fewer_recordings_and_ticks_are_fewer_folds(tiny_store: Make, tmp_path: 
         fold_by_recording(store, 5, 31)
 
 
-def test_deals_differ_and_each_holds_every_recording_out_once(
-    tiny_store: Make, tmp_path: Path
-) -> None:
+def test_deals_differ_and_each_holds_every_recording_out_once(tiny_store, tmp_path) -> None:
     store = FeatureStore.open(tiny_store(tmp_path, episodes=12))
     folds = fold_by_recording(store, 3, 8, repeats=4)
     assert folds.deals.shape == (4, 12)
@@ -67,8 +60,6 @@ def test_deals_differ_and_each_holds_every_recording_out_once(
 
 PENALTIES = (1e-3, 1e-1, 1.0, 30.0)
 Rows = tuple[np.ndarray, np.ndarray, ProbeFolds]
-Nested = Callable[..., tuple[np.ndarray, np.ndarray]]
-ByFold = Callable[..., np.ndarray]
 
 
 @pytest.fixture
@@ -85,9 +76,7 @@ def rows() -> Rows:
     return x, y, ProbeFolds(np.arange(200), group, deals, ())
 
 
-def test_scores_and_penalties_are_those_of_rows(
-    rows: Rows, nested: Nested, r2_by_fold: ByFold
-) -> None:
+def test_scores_and_penalties_are_those_of_rows(rows: Rows) -> None:
     x, y, folds = rows
     score = cross_validate(x, y, folds, PENALTIES)
     means = []
@@ -102,9 +91,7 @@ def test_scores_and_penalties_are_those_of_rows(
     assert score.mean == pytest.approx(np.mean(means), abs=1e-8)
 
 
-def test_each_known_block_keeps_its_own_penalties(
-    rows: Rows, nested: Nested, r2_by_fold: ByFold
-) -> None:
+def test_each_known_block_keeps_its_own_penalties(rows: Rows) -> None:
     x, y, folds = rows
     of_known = np.array([[1e-2, 1.0, 1.0, 30.0], [3.0, 1e-3, 0.1, 1.0]])
     known = [(x[:, [0]], of_known), (x[:, [3, 4]], 2 * of_known)]

@@ -12,16 +12,10 @@ from pipeline.base.config import ProbeParams
 from pipeline.base.errors import ConfigError, NumericsError
 from pipeline.evaluate.probe.inputs import SlotName
 from pipeline.evaluate.probe.ridge import ProbeFolds, ProbeScore
-from pipeline.evaluate.probe.study import (
-    Known,
-    ProbeResult,
-    ProbeStudy,
-    probe,
-    ranked,
-    recommend,
-)
+from pipeline.evaluate.probe.study import Known, ProbeResult, ProbeStudy, probe, ranked, recommend
 from pipeline.evaluate.probe.tables import advice, metrics, table
 from pipeline.store import FeatureStore
+from tests.evaluate.probe.conftest import limited, nested, r2_by_fold, renamed
 
 Make = Callable[..., Any]
 
@@ -54,9 +48,7 @@ def test_the_slot_that_carries_the_action_is_first(tiny_store: Make, tmp_path: P
         assert abs(other.alone.mean) < 0.1
 
 
-def test_a_codec_is_judged_by_its_error_and_by_what_it_costs(
-    tiny_store: Make, tmp_path: Path
-) -> None:
+def test_a_codec_is_judged_by_its_error_and_by_what_it_costs(tiny_store, tmp_path) -> None:
     store = FeatureStore.open(tiny_store(tmp_path, episodes=24, slots=5))
     features = store.array("vl/features")
     features[..., 3] *= 1000  # as the few huge channels of large models
@@ -92,9 +84,7 @@ def test_a_codec_is_judged_by_its_error_and_by_what_it_costs(
     assert metrics(timed)["pass_s"] == {"0": 0.0123}
 
 
-def test_directions_of_too_few_rows_are_refused(
-    tiny_store: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_directions_of_too_few_rows_are_refused(tiny_store, tmp_path, monkeypatch) -> None:
     store = FeatureStore.open(tiny_store(tmp_path, slots=1))
     assert probed(store, max_ticks=8).groups
     with pytest.raises(ConfigError, match=r"pca 8: .* has 8\. Set a smaller pca"):
@@ -104,42 +94,37 @@ def test_directions_of_too_few_rows_are_refused(
         probed(store, codecs=({"pca": 8},))
 
 
-@pytest.fixture
-def plain(nested: Make, limited: Make, r2_by_fold: Make) -> Make:
-    """`plain(study, store, slots, score)`: the score is that of ridge regression on the rows.
+def plain(
+    study: ProbeStudy, store: FeatureStore, slots: tuple[int, ...], score: ProbeScore
+) -> np.ndarray:
+    """The inputs of these slots; the score is that of ridge regression on the rows.
 
     Every tick is a row of its own, although the store is read a VL row at a time; where a slot is
     not valid its mean is read.
     """
-
-    def check(
-        study: ProbeStudy, store: FeatureStore, slots: tuple[int, ...], score: ProbeScore
-    ) -> np.ndarray:
-        ticks, fold = study.folds.ticks, study.folds.fold
-        rows, first, of_tick = np.unique(
-            store.array("tick/vl_row")[ticks], return_index=True, return_inverse=True
-        )
-        columns = []
-        for slot in slots:
-            valid = store.array("vl/slot_valid")[rows, slot] != 0
-            columns.append(np.zeros((len(rows), 8)))
-            raw = store.array("vl/features")[rows[valid], slot].astype(np.float64)
-            columns[-1][valid] = limited(raw, fold[:, first[valid]])
-        x = np.hstack(columns)[of_tick]
-        y = store.array("tick/action").astype(np.float64)[ticks[:, None] + np.arange(2)]
-        y = y.reshape(len(y), -1)
-        varies = y.std(0) > 0
-        for repeat, deal in enumerate(fold):
-            r2, chosen = nested(x, y, deal, PENALTIES)
-            scored = r2_by_fold(score, study.folds, repeat)
-            np.testing.assert_allclose(scored[:, varies], r2[:, varies], atol=1e-8)
-            np.testing.assert_array_equal(score.penalties[repeat], chosen)
-        return x
-
-    return check
+    ticks, fold = study.folds.ticks, study.folds.fold
+    rows, first, of_tick = np.unique(
+        store.array("tick/vl_row")[ticks], return_index=True, return_inverse=True
+    )
+    columns = []
+    for slot in slots:
+        valid = store.array("vl/slot_valid")[rows, slot] != 0
+        columns.append(np.zeros((len(rows), 8)))
+        raw = store.array("vl/features")[rows[valid], slot].astype(np.float64)
+        columns[-1][valid] = limited(raw, fold[:, first[valid]])
+    x = np.hstack(columns)[of_tick]
+    y = store.array("tick/action").astype(np.float64)[ticks[:, None] + np.arange(2)]
+    y = y.reshape(len(y), -1)
+    varies = y.std(0) > 0
+    for repeat, deal in enumerate(fold):
+        r2, chosen = nested(x, y, deal, PENALTIES)
+        scored = r2_by_fold(score, study.folds, repeat)
+        np.testing.assert_allclose(scored[:, varies], r2[:, varies], atol=1e-8)
+        np.testing.assert_array_equal(score.penalties[repeat], chosen)
+    return x
 
 
-def test_scores_are_those_of_a_plain_ridge_regression(store: FeatureStore, plain: Make) -> None:
+def test_scores_are_those_of_a_plain_ridge_regression(store: FeatureStore) -> None:
     """A feature rests but in one recording, and another has a spike."""
     store.array("vl/features")[10:, 0, 2] = 0.5
     store.array("vl/features")[33, 1, 3] = 300
@@ -151,7 +136,7 @@ def test_scores_are_those_of_a_plain_ridge_regression(store: FeatureStore, plain
     assert (group.channels, group.inputs) == (24, 24)
 
 
-def test_a_slot_stands_at_its_mean_where_it_is_not_valid(store: FeatureStore, plain: Make) -> None:
+def test_a_slot_stands_at_its_mean_where_it_is_not_valid(store: FeatureStore) -> None:
     store.array("vl/slot_valid")[12:17, 1] = 0
     store.array("vl/features")[12:17, 1] = np.nan  # what is not valid is not read
     study = probed(store, folds=3, repeats=2)
@@ -170,7 +155,7 @@ def test_a_slot_that_is_valid_nowhere_says_nothing(store: FeatureStore) -> None:
     metrics(study)
 
 
-def test_only_the_plain_variant_is_read(tiny_store: Make, tmp_path: Path, renamed: Make) -> None:
+def test_only_the_plain_variant_is_read(tiny_store: Make, tmp_path: Path) -> None:
     plain = {"layer": 1, "norm": True, "pooling": "mean"}
     slots = [{**plain, "pooling": pooling} for pooling in ("mean", "last")]
     path = tiny_store(tmp_path, slots=6)
@@ -183,9 +168,7 @@ def test_only_the_plain_variant_is_read(tiny_store: Make, tmp_path: Path, rename
         np.testing.assert_array_equal(one.alone.losses, other.alone.losses)
 
 
-def test_a_wide_group_is_read_along_its_main_directions(
-    store: FeatureStore, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_wide_group_is_read_along_its_main_directions(store, monkeypatch) -> None:
     monkeypatch.setattr("pipeline.evaluate.probe.inputs.WIDTH", 12)
     study = probed(store)
     (group,) = study.groups
@@ -202,11 +185,10 @@ def test_threads_change_no_bit(store: FeatureStore) -> None:
         np.testing.assert_array_equal(one.beside.losses, other.beside.losses)
 
 
-@pytest.mark.parametrize("ticks", [None, 60])
-def test_a_number_that_is_none_is_named(store: FeatureStore, ticks: int | None) -> None:
+def test_a_number_that_is_none_is_named(store: FeatureStore) -> None:
     store.array("vl/features")[12, 1, 4] = np.nan
     with pytest.raises(NumericsError, match=r"slot 1: .*episode_001, VL row 2 .*, channel 4"):
-        probed(store, max_ticks=ticks)
+        probed(store, max_ticks=60)
     store.array("vl/features")[12, 1, 4] = 0
     store.array("tick/action")[40, 1] = np.inf
     with pytest.raises(
@@ -215,18 +197,14 @@ def test_a_number_that_is_none_is_named(store: FeatureStore, ticks: int | None) 
         probed(store)
 
 
-def test_what_is_known_grows_by_what_the_store_has(
-    tiny_store: Make, tmp_path: Path, store: FeatureStore
-) -> None:
+def test_what_is_known_grows_by_what_the_store_has(tiny_store, tmp_path, store) -> None:
     names = [known.name for known in probed(store).known]
     assert names == ["past actions", "past actions + state", "past actions + state + sensor"]
     study = probed(FeatureStore.open(tiny_store(tmp_path, sensor_channels=0, state_dim=0)))
     assert [(known.name, known.inputs) for known in study.known] == [("past actions", 2 * 5)]
 
 
-def test_the_cheapest_of_those_that_are_tied_is_recommended(
-    tiny_store: Make, tmp_path: Path, renamed: Make
-) -> None:
+def test_the_cheapest_of_those_that_are_tied_is_recommended(tiny_store, tmp_path) -> None:
     """Two layers hold the same numbers, a third pooling holds noise."""
     slots = [
         {"layer": 7, "norm": True, "pooling": "mean"},
@@ -237,7 +215,6 @@ def test_the_cheapest_of_those_that_are_tied_is_recommended(
     store.array("vl/features")[:, 1] = store.array("vl/features")[:, 0]
     study = probed(store, horizon=1)
     found = recommend(study)
-    assert found is not None
     assert found.reading == "beside"
     assert [one.name.layer for one in found.tied] in ([2], [7])
     said = advice(study)
@@ -290,7 +267,6 @@ def test_features_that_help_alone_are_said_to() -> None:
     good, better = by_recording(0.2, 0.1, 0.2, 0.3, 0.2), by_recording(0.4, 0.3, 0.4, 0.5, 0.4)
     study = study_of(wild, (1, good, beside), (16, better, beside))
     found = recommend(study)
-    assert found is not None
     assert (found.reading, found.chosen.name.layer, found.tied) == ("alone", 1, ())
     assert "features alone" in advice(study) and "layers: [1]" in advice(study)
 
@@ -301,7 +277,6 @@ def test_a_tie_keeps_half_of_the_gain() -> None:
     wide = by_recording(0.8, 0.95, 0.95, 0.95, 0.4)
     wider = by_recording(0.95, 0.95, 0.95, 0.95, -1.5)
     found = recommend(study_of(known, (9, known, best), (4, known, wide), (1, known, wider)))
-    assert found is not None
     assert found.best.beside is best
     assert [one.name.layer for one in found.tied] == [1]
     assert found.chosen.name.layer == 1

@@ -1,7 +1,5 @@
 """A pass is timed with the store's own model, or not at all."""
 
-from pathlib import Path
-
 import pytest
 
 from pipeline.base.config import load_params
@@ -12,9 +10,7 @@ from pipeline.store import FeatureStore
 from pipeline.vlm.qwen import Extractor
 
 
-def test_each_pass_stops_after_its_layer(
-    trained_once: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_each_pass_stops_after_its_layer(trained_once, monkeypatch) -> None:
     params, ran = load_params(trained_once), list[int]()
     store = FeatureStore.open(params.extract.store)
     monkeypatch.setattr(timing, "_PASSES", 1)

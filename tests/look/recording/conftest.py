@@ -10,7 +10,7 @@ import matplotlib as mpl
 import numpy as np
 import pytest
 
-from pipeline.base.config import DataParams, Source
+from pipeline.base.config import DataParams, Params, Source
 from pipeline.base.errors import Issue
 from pipeline.data import open_recordings
 from pipeline.data.timeline import choose_action_rotation
@@ -28,6 +28,9 @@ from pipeline.simulation.insertion_formats import (
 from pipeline.simulation.recorder import simulate_episode
 
 EPOCH_S = 1.767e9 + 0.25
+PARAMS = Params.model_validate(
+    {"data": {"sources": [{"name": "s", "path": "."}]}, "vlm": {"checkpoint": "none"}}
+)
 
 
 @pytest.fixture(autouse=True)
@@ -46,16 +49,12 @@ def healthy(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("healthy")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(rendering, "_NOISE", 0.0)
-        write_all(root)
+        episode = simulate_episode(23, EPOCH_S)
+        write_raw(root / "raw" / "Red_point", episode)
+        write_new(root / "new" / "Red_point", episode, ABUTTING, robot_clock=True)
+        write_old(root / "old" / "Red_point", episode)
+        write_lerobot(root / "lerobot", iter([episode]))
     return root
-
-
-def write_all(root: Path) -> None:
-    episode = simulate_episode(23, EPOCH_S)
-    write_raw(root / "raw" / "Red_point", episode)
-    write_new(root / "new" / "Red_point", episode, ABUTTING, robot_clock=True)
-    write_old(root / "old" / "Red_point", episode)
-    write_lerobot(root / "lerobot", iter([episode]))
 
 
 @pytest.fixture

@@ -1,6 +1,5 @@
 """Each issue is found where it is put, and none where there is none."""
 
-import json
 import pickle
 import shutil
 from collections.abc import Callable
@@ -17,22 +16,12 @@ Find = Callable[..., tuple[Issue, ...]]
 Copied = Callable[[str], Path]
 
 
-def only(folder: Path, pattern: str) -> Path:
-    (path,) = folder.glob(pattern)
-    return path
-
-
 def frames(folder: Path, view: str) -> list[Path]:
     return sorted((folder / view).rglob("*.jpg"))
 
 
 def time_of(path: Path) -> float:
     return float(path.stem.rsplit("_", 1)[-1])
-
-
-@pytest.mark.parametrize("format", ["raw", "new", "old", "lerobot"])
-def test_nothing_is_found_in_a_healthy_recording(healthy: Path, issues_of: Find, format: str):
-    assert issues_of(healthy / format) == ()
 
 
 def test_little_is_found_in_real_recordings(shared_data: Path, issues_of: Find) -> None:
@@ -73,13 +62,8 @@ class TestCameras:
             path.unlink()
         assert issues_of(folder) == ()
 
-    def test_a_view_that_the_metadata_lists(self, copied: Copied, issues_of: Find) -> None:
-        folder = copied("new")
-        metadata(folder, camera_views=["View1", "View2", "View5", "View9"])
-        assert any("camera_views has View9" in issue.message for issue in issues_of(folder))
-        # A view that the params leave out is not missing.
-        metadata(folder, camera_views=["View1", "View2", "View5"])
-        assert issues_of(folder, views=["View1"]) == ()
+    def test_a_view_that_the_params_leave_out(self, healthy: Path, issues_of: Find) -> None:
+        assert issues_of(healthy / "new", views=["View1"]) == ()
 
     def test_no_camera_at_all(self, copied: Copied, issues_of: Find) -> None:
         folder = copied("raw")
@@ -89,20 +73,6 @@ class TestCameras:
         (issue,) = issues_of(folder)
         assert (issue.kind, issue.stream) == ("missing", "cameras")
         assert issue.message == "no camera has a frame: the VLM would see no picture"
-
-    def test_a_promised_stream_that_is_broken_is_told_once(self, copied, issues_of):
-        folder = copied("new")
-        (folder / "sensor_data.npz").write_bytes(b"")
-        assert [issue.kind for issue in issues_of(folder)] == ["unreadable"]
-
-
-class TestClocks:
-    def test_another_rate_than_fps(self, copied: Copied, issues_of: Find) -> None:
-        root = copied("lerobot")
-        info = json.loads((root / "meta/info.json").read_text())
-        (root / "meta/info.json").write_text(json.dumps(info | {"fps": 15}))
-        issues = issues_of(root, action_hz=None)
-        assert any("say 15 Hz (LeRobot: fps in meta/info.json)" in one.message for one in issues)
 
 
 class TestChannels:
@@ -126,7 +96,7 @@ class TestChannels:
             table[row, 6] = 360
             return table
 
-        path = only(folder, "robot_state_*.csv")
+        (path,) = folder.glob("robot_state_*.csv")
         change_csv(path, leap)
         time = np.loadtxt(path, delimiter=",", skiprows=1)[:, 1]
         (issue,) = issues_of(folder)
@@ -146,8 +116,3 @@ def test_a_recording_may_be_very_short(
     assert view.timeline is None or len(view.timeline.time) <= 1
     found = issues_of(folder)
     assert all(issue.kind in ("no ticks",) for issue in found) and found
-
-
-def metadata(folder: Path, **changes: object) -> None:
-    path = folder / "metadata.json"
-    path.write_text(json.dumps(json.loads(path.read_text()) | changes))

@@ -2,10 +2,9 @@
 
 import pickle
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -17,15 +16,16 @@ from pipeline.look.page.blocks import Issues, Picture, Report, Text, Tokens
 from pipeline.look.page.writing import write_report
 from pipeline.look.recording.page import RecordingsOverview, recordings_report, survey_recordings
 from pipeline.look.subject import subject_of
+from tests.look.recording.conftest import PARAMS
 
-PARAMS = Path(__file__).resolve().parents[3] / "params.yaml"
+PARAMS_FILE = Path(__file__).resolve().parents[3] / "params.yaml"
 
 
 @pytest.fixture
 def params_of(demo_checkpoint: Path) -> Callable[..., Params]:
     def load(path: Path, *more: str) -> Params:
         checkpoint = f"vlm.checkpoint={demo_checkpoint}"
-        return load_params(PARAMS, [f"inspect.path={path}", checkpoint, *more])
+        return load_params(PARAMS_FILE, [f"inspect.path={path}", checkpoint, *more])
 
     return load
 
@@ -33,10 +33,6 @@ def params_of(demo_checkpoint: Path) -> Callable[..., Params]:
 def report_of(params: Params) -> Report:
     subject = subject_of(params)
     return recordings_report(subject.recordings(None), params, subject.name)
-
-
-def words_of(report: Report) -> str:
-    return "\n".join(one.words for one in report.blocks(Text))
 
 
 @pytest.mark.slow
@@ -71,7 +67,7 @@ def test_what_is_missing_is_said(recorded, params_of, tmp_path):
     sensor.write_bytes(b"no archive")
     report = report_of(params_of(lab, f"vlm.checkpoint={tmp_path / 'nowhere'}"))
     assert dict(report.tiles)["errors"] == "1"
-    said = words_of(report)
+    said = "\n".join(text.words for text in report.blocks(Text))
     assert str(sensor) in said
     assert "No sample can be made" in said
     assert ".. " not in said
@@ -81,13 +77,8 @@ def test_what_is_missing_is_said(recorded, params_of, tmp_path):
     assert folder.name in first.issues[0].episode
 
 
-def survey(*sources: Source, views: Sequence[str] | None = None, **data: Any) -> RecordingsOverview:
-    document = {
-        "data": {"sources": [source.model_dump() for source in sources], **data},
-        "vlm": {"checkpoint": "none"},
-    }
-    params = Params.model_validate(document)
-    return survey_recordings(open_recordings(params.data.sources, views=views), params)
+def survey(*sources: Source) -> RecordingsOverview:
+    return survey_recordings(open_recordings(sources), PARAMS)
 
 
 @pytest.fixture

@@ -1,16 +1,12 @@
 """What pictures of a recording show lies where and when it was recorded."""
 
 import io
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from matplotlib.figure import Figure
 
-from pipeline.base.config import Params
 from pipeline.data import Channels, Stream
-from pipeline.look.page.blocks import Picture
 from pipeline.look.recording.cameras import camera_blocks, draw_views
 from pipeline.look.recording.clocks import Clock, clock_blocks, draw_lanes
 from pipeline.look.recording.episode import LoadedRecording
@@ -21,14 +17,7 @@ from pipeline.look.recording.streams import (
     sensor_blocks,
     statistics_blocks,
 )
-
-PARAMS = Params.model_validate(
-    {
-        "data": {"sources": [{"name": "s", "path": "."}]},
-        "vlm": {"checkpoint": "none"},
-        "inspect": {"samples": 1},
-    }
-)
+from tests.look.recording.conftest import PARAMS
 
 
 def test_views_are_shown_at_ticks_with_the_age_of_each_frame(view: LoadedRecording) -> None:
@@ -51,14 +40,9 @@ def test_names_are_written_as_they_are(view: LoadedRecording) -> None:
     said = {text.get_text().strip() for one in legends if one for text in one.get_texts()}
     assert said == set(names)
     for figure in (draw_motion(named), draw_sensor(named)):
-        svg = saved(figure, "svg")
-        assert b"foo$" in svg or b"bar$" in svg
-
-
-@pytest.fixture
-def draw(view: LoadedRecording) -> Callable[..., Picture]:
-    """Makes pictures of that episode."""
-    return lambda name, caption, draw: Picture(name, caption, lambda: draw(view))
+        figure.set_layout_engine("none")  # it takes most of the time
+        figure.savefig(file := io.BytesIO(), format="svg", dpi=30)
+        assert b"foo$" in file.getvalue() or b"bar$" in file.getvalue()
 
 
 def test_lanes_show_every_clock_once_with_its_gap(view: LoadedRecording) -> None:
@@ -74,18 +58,10 @@ def test_lanes_show_every_clock_once_with_its_gap(view: LoadedRecording) -> None
     assert axis.get_xlim()[0] < gap.start_s - view.zero < axis.get_xlim()[1]
 
 
-def test_without_ticks_lanes_are_drawn_and_without_streams_nothing(view, draw) -> None:
+def test_without_ticks_lanes_are_drawn_and_without_streams_nothing(view) -> None:
     (axis,) = draw_lanes(replace(view, timeline=None)).axes
     assert len(axis.get_yticks()) == 5
     absent = {"cameras": {}, "sensor": None, "state": None, "poses": None, "action": None}
     empty = replace(view, timeline=None, **absent)
     for blocks in (camera_blocks, sensor_blocks, motion_blocks, clock_blocks, statistics_blocks):
-        assert blocks(empty, draw, PARAMS) == []
-
-
-def saved(figure: Figure, format: str) -> bytes:
-    """A file of it, of few pixels, without the layout that takes most of the time."""
-    figure.set_layout_engine("none")
-    stream = io.BytesIO()
-    figure.savefig(stream, format=format, dpi=30)
-    return stream.getvalue()
+        assert blocks(empty, lambda *_: pytest.fail("draws nothing"), PARAMS) == []

@@ -69,13 +69,6 @@ def test_samples_are_those_of_training(healthy: Path, look: Look, format: str) -
             assert np.array_equal(frame, batch.images[place][name])
 
 
-def test_of_an_episode_that_training_refuses_there_is_no_sample(copied, look):
-    folder = copied("raw")
-    next(folder.glob("sensor_data_*.npz")).write_bytes(b"no archive")
-    with pytest.raises(RecordingError, match="sensor_data"):
-        cut_samples(look(folder), params_of(5))
-
-
 @pytest.fixture(scope="module")
 def params() -> Params:
     return params_of(3, sensor_window=65, state_window=20, horizon=4)

@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.base.config import Params
 from pipeline.base.text import Table
 from pipeline.data import Channels, Stream
 from pipeline.data.contact import force_columns
@@ -15,22 +14,16 @@ from pipeline.look.recording.episode import LoadedRecording
 from pipeline.look.recording.streams import contacts, describe_channels, statistics_blocks
 from pipeline.simulation.insertion import TICK_HZ
 from pipeline.simulation.recorder import Demonstration, simulate_episode
+from tests.look.recording.conftest import PARAMS
 
 Look = Callable[..., LoadedRecording]
-PARAMS = Params.model_validate(
-    {"data": {"sources": [{"name": "s", "path": "."}]}, "vlm": {"checkpoint": "none"}}
-)
-
-
-def table_of(view: LoadedRecording) -> Table:
-    (table,) = statistics_blocks(view, lambda *_: pytest.fail("draws nothing"), PARAMS)
-    assert isinstance(table, Table)
-    return table
 
 
 def test_statistics_of_every_channel(healthy: Path, look: Look) -> None:
     view = look(healthy / "raw")
-    rows = {row[:2]: row[2:] for row in table_of(view).rows}
+    (table,) = statistics_blocks(view, lambda *_: pytest.fail("draws nothing"), PARAMS)
+    assert isinstance(table, Table)
+    rows = {row[:2]: row[2:] for row in table.rows}
     assert view.sensor is not None and view.state is not None and view.timeline is not None
     # Poses are columns of the state, the A-scan is one row.
     assert len(rows) == 2 + 12 + 7

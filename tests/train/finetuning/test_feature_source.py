@@ -61,6 +61,15 @@ def moves(parameter: nn.Parameter) -> bool:
     return parameter.grad is not None and bool(parameter.grad.abs().max() > 0)
 
 
+def extracted_with(given: Params, place: Path, **vlm: str) -> FeatureStore:
+    """The store of the same recordings with another model."""
+    document = given.model_dump(mode="json")
+    document["vlm"] |= vlm
+    document["extract"]["store"] = str(place)
+    extract(Params.model_validate(document), say=lambda _: None)
+    return FeatureStore.open(place)
+
+
 def assert_judged_as_in_training(output: Path, store: FeatureStore) -> None:
     """The best policy takes the store, and its error on val is the one that chose it."""
     best = load_policy(find_policy(output))
@@ -117,11 +126,8 @@ def test_what_is_kept_is_the_averaged_model_that_was_judged(params, tmp_path):
         "adapter_model.safetensors",
         "tuned_on.json",
     }
-    document = given.model_dump(mode="json")
-    document["vlm"]["adapter"] = str(output / "best" / "adapter")
-    document["extract"]["store"] = str(tmp_path / "tuned.zarr")
-    extract(Params.model_validate(document), say=lambda _: None)
-    store, base = FeatureStore.open(tmp_path / "tuned.zarr"), made.store
+    adapter = str(output / "best" / "adapter")
+    store, base = extracted_with(given, tmp_path / "tuned.zarr", adapter=adapter), made.store
     assert store.spec["digest"] != base.spec["digest"]
     # What it was tuned on goes along with the features, and is no part of what they are.
     tuned = read_tuned_on(output / "best" / "adapter")
@@ -134,7 +140,7 @@ def test_what_is_kept_is_the_averaged_model_that_was_judged(params, tmp_path):
         assert told == {name: part.content for name, part in listed[side].items()}
     assert refuse_tuned_episodes(store, made.split) == []
     (output / "best" / "adapter" / "tuned_on.json").unlink()
-    vlm = Params.model_validate(document).vlm
+    vlm = given.vlm.model_copy(update={"adapter": adapter})
     silent = feature_spec(vlm, store.spec["storage_dtype"], store.spec["views"], file_digest)
     assert silent.digest == store.spec["digest"]
 
@@ -183,11 +189,9 @@ def test_an_adapter_learns_through_the_pooler_that_reads_its_tokens(params, tmp_
     assert adapters and all(map(moves, adapters))
 
     made.fit()
-    document = given.model_dump(mode="json")
-    document["vlm"]["adapter"] = str(given.finetune.output / "best" / "adapter")
-    document["extract"]["store"] = str(tmp_path / "tuned.zarr")
-    extract(Params.model_validate(document), say=lambda _: None)
-    assert_judged_as_in_training(given.finetune.output, FeatureStore.open(tmp_path / "tuned.zarr"))
+    adapter = str(given.finetune.output / "best" / "adapter")
+    tuned = extracted_with(given, tmp_path / "tuned.zarr", adapter=adapter)
+    assert_judged_as_in_training(given.finetune.output, tuned)
 
 
 def test_a_run_goes_on_from_any_checkpoint_to_the_same_bits(params, tmp_path, stop_at):
@@ -223,11 +227,9 @@ def test_full_tuning_saves_a_checkpoint_to_extract_with(params, tmp_path):
     made = trainer(given)
     made.fit()
     best = given.finetune.output / "best"
-    document = given.model_dump(mode="json")
-    document["vlm"]["checkpoint"] = str(best / "checkpoint")
-    document["extract"]["store"] = str(tmp_path / "full.zarr")
-    extract(Params.model_validate(document), say=lambda _: None)
-    check_store(load_policy(best), FeatureStore.open(tmp_path / "full.zarr"))
+    checkpoint = str(best / "checkpoint")
+    store = extracted_with(given, tmp_path / "full.zarr", checkpoint=checkpoint)
+    check_store(load_policy(best), store)
 
 
 def test_the_tuned_features_of_a_projected_store_keep_its_basis(params, tmp_path):
