@@ -16,6 +16,8 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import closing, redirect_stdout
+from ctypes.util import find_library
+from importlib.util import find_spec
 from io import StringIO
 from multiprocessing import forkserver, get_context
 from multiprocessing.context import ForkServerContext
@@ -480,6 +482,17 @@ def missing() -> Callable[[str], None]:
         pytest.skip(said)
 
     return stop
+
+
+@pytest.fixture(scope="session")
+def meta_world(missing: Callable[[str], None]) -> None:
+    """Meta-World, and what draws its frames."""
+    if find_spec("metaworld") is None:
+        pytest.skip("needs the extra `metaworld`")
+    other = "DISPLAY" in os.environ or torch.cuda.is_available()
+    drawing = os.environ.get("MUJOCO_GL", "other" if other else "osmesa")
+    if drawing == "osmesa" and find_library("OSMesa") is None:
+        missing("nothing draws Meta-World's frames: install OSMesa (Debian: libosmesa6)")
 
 
 # One a module, not one a session: while playwright runs, no other test can run an event loop.

@@ -4,7 +4,6 @@ import json
 from collections.abc import Callable
 from concurrent.futures import Future
 from dataclasses import replace
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -16,10 +15,6 @@ from pipeline.base.config import Source
 from pipeline.base.errors import ConfigError
 from pipeline.data import open_recordings
 from pipeline.simulation.meta_world import HZ, VIEW, instruction_of
-
-needs_meta_world = pytest.mark.skipif(
-    find_spec("metaworld") is None, reason="needs the extra `metaworld`"
-)
 
 
 def test_no_two_purposes_or_runs_share_an_episode() -> None:
@@ -33,7 +28,7 @@ def test_no_two_purposes_or_runs_share_an_episode() -> None:
         seeds_of("validation", 100)
 
 
-@needs_meta_world
+@pytest.mark.usefixtures("meta_world")
 @pytest.mark.extra
 def test_a_set_is_what_the_expert_did_and_is_recorded_once(tmp_path: Path) -> None:
     asked = Record(task="button-press-topdown-v3", run=0, episodes=2, image=48, shadows=False)
@@ -62,7 +57,7 @@ def test_a_set_is_what_the_expert_did_and_is_recorded_once(tmp_path: Path) -> No
         record(tmp_path, [other], jobs=1)
 
 
-@needs_meta_world
+@pytest.mark.usefixtures("meta_world")
 @pytest.mark.extra
 def test_the_protocol_goes_from_demonstrations_to_a_table(tmp_path, monkeypatch, capsys):
     """Tiny: three demonstrations of one task, six steps, rollouts of one episode."""

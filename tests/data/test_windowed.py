@@ -171,6 +171,7 @@ def test_cameras_that_metadata_promises_must_be_there(folder, write, only):
         RecordingError, match=r"metadata\.json: camera_views has View7, and images/"
     ):
         only(folder).cameras()
+    assert list(only(folder, views=["View1"]).cameras()) == ["View1"]
 
 
 @pytest.mark.parametrize("sensor_hz", [65.0, 550.0])

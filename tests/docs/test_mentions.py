@@ -44,6 +44,7 @@ def keys() -> set[str]:
 
 def test_every_command_is_there():
     named = {(page, name) for page in PAGES for name in COMMAND.findall(text_of(page))}
+    assert named
     assert not [one for one in named if one[1] not in {*STAGES, "command"}]
 
 
@@ -56,6 +57,7 @@ def test_every_key_is_there():
         if not piece.startswith("```python")
         for section, key in KEY.findall(piece)
     }
+    assert named
     # demo.zarr is a file of the demo, demo.episodes a key.
     strange = [one for one in named if one[1] not in known]
     assert not [one for one in strange if one[1].rpartition(".")[2] not in FILES]
@@ -63,6 +65,7 @@ def test_every_key_is_there():
 
 def test_every_link_within_the_project_resolves():
     links = [(page, "".join(link)) for page in PAGES for link in LINK.findall(text_of(page))]
+    assert links
     for page, target in links:
         if target.startswith(("https://", "http://", "#", "mailto:")):
             continue

@@ -41,7 +41,9 @@ def apply(diff: str, text: str) -> str:
 def follow(page: Path, project: Path) -> None:
     """Change the project as the page says."""
     place = project
-    for part in PART.finditer(page.read_text(encoding="utf-8")):
+    parts = [*PART.finditer(page.read_text(encoding="utf-8"))]
+    assert parts
+    for part in parts:
         if part["file"]:
             place = project / part["file"]
             continue

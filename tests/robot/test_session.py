@@ -140,6 +140,7 @@ def test_a_pass_of_the_episode_before_is_not_taken(served_policy, observe) -> No
     session.infer(observe(0))
     blocked = Blocked(served)
     session.infer(observe(3))  # begins a pass that does not end
+    assert blocked.looking.wait(60)
     served.glance.before = lambda: None
     begin = served.begin_pass
 

@@ -1,7 +1,6 @@
 """Meta-World's tasks as environments; most tests need the extra `metaworld`."""
 
 import sys
-from importlib.util import find_spec
 
 import gymnasium
 import numpy as np
@@ -39,7 +38,7 @@ def test_any_task_has_an_instruction():
     assert instruction_of("window-close") == "Window close."
 
 
-@pytest.mark.skipif(find_spec("metaworld") is None, reason="needs the extra `metaworld`")
+@pytest.mark.usefixtures("meta_world")
 @pytest.mark.extra
 class TestMetaWorld(EnvironmentContract):
     @pytest.fixture

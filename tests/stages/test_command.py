@@ -43,12 +43,14 @@ def test_two_and_one_message_for_what_the_user_can_mend(capfd, tmp_path):
 
 def test_two_for_bad_params_and_a_misspelt_key_is_recognised(capsys):
     wrong = [
+        "nothing.like=it",
         "train_head.expert.layer=2",
         "data.sources=[{name: a, paths: x}, {name: b}]",
     ]
     options = [word for override in wrong for word in ("--set", override)]
     assert run("Summary.", print, ["--params", PARAMS, *options]) == 2
     err = capsys.readouterr().err
+    assert "nothing: unknown key; --keys lists" in err
     assert "train_head.expert.layer: unknown key; --keys lists" in err
     assert "data.sources.0.paths: unknown key; --keys lists" in err
     assert "data.sources.1: expected either path or hub, found neither" in err

@@ -120,6 +120,10 @@ def test_a_flipped_bit_is_refused_where_it_would_be_learnt_from(
     write_params, flip, tmp_path, capsys
 ):
     arguments = ["--params", str(write_params(max_steps=3))]
+    assert run("", train_head.main, [*arguments, "--set", "train_head.device=cuda:77"]) == 2
+    assert not (tmp_path / "params/head.part").exists(), "params alone are wrong"
+    capsys.readouterr()
+
     file = flip(tmp_path / "params.zarr", "sensor/values")
     assert run("", train_head.main, arguments) == 2
     error = capsys.readouterr().err

@@ -1,6 +1,7 @@
 """The page as a reader has it: sound at every width, with and without scripts, on paper."""
 
 import json
+import time
 from pathlib import Path
 
 import pytest
@@ -8,6 +9,19 @@ import pytest
 
 def test_a_browser_finds_every_block_sound(every_page, assert_page_is_sound):
     assert_page_is_sound(every_page)
+
+
+def test_a_request_and_an_error_are_trouble(every_page, tmp_path, browser_page):
+    planted = '<img src="https://example.org/a.png"><script>throw new Error("wrong")</script>'
+    text = every_page.read_text(encoding="utf-8")
+    page = tmp_path / "a.html"
+    page.write_text(text.replace("<main", f"{planted}<main", 1), encoding="utf-8")
+    visit = browser_page(page)
+    until = time.monotonic() + 30
+    while len(visit.trouble) < 2 and time.monotonic() < until:
+        visit.page.wait_for_timeout(10)
+    for trouble in ("example.org", "wrong"):
+        assert trouble in str(visit.trouble)
 
 
 @pytest.mark.slow

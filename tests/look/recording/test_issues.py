@@ -62,9 +62,6 @@ class TestCameras:
             path.unlink()
         assert issues_of(folder) == ()
 
-    def test_a_view_that_the_params_leave_out(self, healthy: Path, issues_of: Find) -> None:
-        assert issues_of(healthy / "new", views=["View1"]) == ()
-
     def test_no_camera_at_all(self, copied: Copied, issues_of: Find) -> None:
         folder = copied("raw")
         assert any(issue.kind == "missing" for issue in issues_of(folder, views=[]))
