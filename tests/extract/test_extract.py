@@ -178,7 +178,8 @@ class TestWhatItTakesOver:
         assert run(changed(extract=knobs, vlm={"attention": "eager"}))[0] is None
         path = recordings / "Touch_dot/episode_1/robot_states.npz"
         path.write_bytes(path.read_bytes())
-        assert run(params)[0] is None, "a touched file is read again"
+        nothing = "up to date, nothing to do (stages.verify reads what it holds)"
+        assert run(params) == (None, [f"{params.extract.store}: {nothing}"]), "a touched file"
         ledger = params.extract.store.with_name("made.zarr.files.sqlite")
         ledger.write_bytes(ledger.read_bytes()[:100] + b"no database" * 100)
         assert run(params)[0] is None, "a lost ledger costs only reading"
@@ -339,6 +340,9 @@ class TestWhatWouldBeLost:
             assert any(str(previous) in line for line in said)
             assert previous.exists() != plan
         assert len(FeatureStore.open(store).episodes) == 2
+        _, said = run(changed(data={"vlm_reuse_count": 2}, extract={"plan": True}))
+        (line,) = (line for line in said if line.startswith(f"{previous} is removed or replaced"))
+        assert "holds 1 episode(s) that are not in this run" in line
         away.rename(recordings / "Press")
         _, said = run(changed(extract={"plan": True}))
         (line,) = (line for line in said if line.startswith(f"{previous} is removed or replaced"))

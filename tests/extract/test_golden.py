@@ -97,14 +97,17 @@ class TestKills:
 
         real = golden_rows._write_frame
 
-        def killed(*args, **kwargs):
+        def killed(*args):
             if next(written) == frames:
                 raise KeyboardInterrupt
             real(*args)
 
+        def killed_before(*_, **__):
+            raise KeyboardInterrupt
+
         with monkeypatch.context() as patch:
             patch.setattr(golden_rows, "_write_frame", killed)
-            patch.setattr(StoreBuild, "seal", killed)
+            patch.setattr(StoreBuild, "seal", killed_before)
             with pytest.raises(KeyboardInterrupt):
                 extract(params, print)
         assert not params.extract.store.exists()

@@ -121,9 +121,11 @@ def test_lost_checksums_cost_the_rows(case):
     assert content(case.store) == content(case.original)
 
 
-def test_arrays_of_other_lengths_are_found(case):
+def test_arrays_of_other_lengths_are_found_and_mended(case):
     edit(case.store / "vl/checksum/zarr.json", lambda document: document.update(shape=[3]))
     assert any("metadata were changed" in issue for issue in verify(case.store).issues)
+    case.mended()
+    assert content(case.store) == content(case.original)
 
 
 def test_other_params_repair_nothing(case):

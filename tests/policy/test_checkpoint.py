@@ -152,12 +152,14 @@ def test_a_description_that_is_none_is_named(checkpoint, tmp_path, place, value,
     [
         (lambda values: values.half(), r'"torch.float16", .* -> \["torch.float32"'),
         (lambda values: values * torch.nan, "expected finite numbers, found NaN"),
+        (lambda values: None, r'null -> \["torch.float32"'),
     ],
-    ids=["float16", "nan"],
+    ids=["float16", "nan", "missing"],
 )
 def test_weights_of_another_policy_are_refused(checkpoint, tmp_path, change, said):
     name = next(name for name, value in checkpoint.weights.items() if value.ndim == 2)
     weights = {**checkpoint.weights, name: change(checkpoint.weights[name])}
+    weights = {name: value for name, value in weights.items() if value is not None}
     save_policy(tmp_path / "best", replace(checkpoint, weights=weights))
     with pytest.raises((CheckpointIncomplete, CheckpointMismatch), match=said) as caught:
         load_policy(tmp_path / "best")

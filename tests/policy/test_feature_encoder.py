@@ -155,8 +155,11 @@ def test_the_pooler_mixes_layers_by_learned_shares():
     changed[:, :20] += 1.0  # the first layer
     age = torch.zeros(2)
     assert not torch.allclose(encoder(features, valid, age), encoder(changed, valid, age))
+    alike = features[:, :20].repeat(1, 2, 1)
+    even = encoder(alike, valid, age)
     encoder.mixture.data = torch.tensor([-1e4, 0.0])
     assert torch.allclose(encoder(features, valid, age), encoder(changed, valid, age))
+    torch.testing.assert_close(encoder(alike, valid, age), even)  # the shares sum to 1
 
 
 def test_the_state_directs_the_queries_and_never_becomes_a_value():

@@ -124,6 +124,7 @@ def test_other_features_or_streams_are_refused(store, params, unfinished, tiny_s
     assert 'feature_spec.digest: "tiny-spec" -> "another"' in said
     assert "streams.state.names" in said
     assert "vlm_reuse_count: 3 -> 5" in said
+    assert f"Remove {unfinished}" in said
     assert (unfinished / "last").exists()
 
 

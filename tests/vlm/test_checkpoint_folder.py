@@ -86,7 +86,8 @@ def test_a_chat_template_that_cannot_be_rendered(copy):
 def test_an_index_names_files_of_its_own_folder(copy, spec):
     index = copy / "model.safetensors.index.json"
     shard = (copy / "model.safetensors").rename(copy / "model-1.safetensors")
-    for name, told in (("../vlm/model-1.safetensors", r"found '\.\./vlm/"), (str(shard), "")):
+    outside = f"../{copy.name}/{shard.name}"
+    for name, told in ((outside, rf"found '\.\./{copy.name}/"), (str(shard), "")):
         index.write_text(json.dumps({"metadata": {}, "weight_map": {"a": name}}))
         with pytest.raises(VLMError, match=rf"{index}: weight_map\.a: .*{told}.*{MEND}"):
             spec(copy)

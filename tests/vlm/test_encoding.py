@@ -117,6 +117,8 @@ def test_batch_equals_single_rows_and_plain_transformers(extractor, rows, demo_c
         alone, alone_valid = ours.model.encode([row])
         torch.testing.assert_close(features[index], alone[0], atol=2e-5, rtol=1e-4)
         assert torch.equal(valid[index], alone_valid[0])
+    backwards, _ = ours.model.encode(prepared[::-1])
+    torch.testing.assert_close(features, backwards.flip(0), atol=2e-5, rtol=1e-4)
 
     reference = Reference(demo_checkpoint, ours.spec.image_size)
     for index, row in enumerate(rows):
