@@ -78,7 +78,7 @@ def said(project: Path) -> str:
     own = {name: value for name, value in os.environ.items() if not name.startswith("PYTEST_")}
     told = {"PYTHONPATH": str(project), "PYTHONDONTWRITEBYTECODE": "1"}
     told |= {"WRITE_GOLDEN_FEATURES": "1"}
-    options = ["-q", "-rp", "-n0", "-p", "no:cacheprovider"]
+    options = ["-q", "-rp", "-n0", "-p", "no:cacheprovider", "--color=no"]
     done = subprocess.run(
         [sys.executable, "-m", "pytest", *options, *TESTS, "-k", ASKED],
         cwd=project,

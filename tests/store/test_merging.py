@@ -108,7 +108,7 @@ def test_all_episodes_follow_one_another(tiny_store: Make, tmp_path: Path, outpu
 def test_an_input_that_is_held_in_part_gives_the_rest(
     tiny_store: Make, tmp_path: Path, output: Path
 ) -> None:
-    """Of equal content: an episode under another name is another episode."""
+    """An episode under another name is another episode, whatever its content."""
     whole = tiny_store(tmp_path, name="whole")
     some = renamed(
         tiny_store(tmp_path, name="some"),

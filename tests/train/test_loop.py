@@ -243,8 +243,9 @@ def test_both_checkpoints_carry_the_golden_rows(tiny_golden, params, trainer, tm
         assert np.array_equal(carried[1].features, store.golden[1].features)
 
 
-def test_a_damaged_golden_row_stops_a_training(tiny_golden, params, trainer, tmp_path):
-    """Before it begins."""
+def test_a_damaged_golden_row_stops_a_training_before_it_begins(
+    tiny_golden, params, trainer, tmp_path
+):
     store = FeatureStore.open(tiny_golden(tmp_path))
     frame = store.path / "golden/1/View1/c/0/0/0"
     frame.unlink()

@@ -47,6 +47,7 @@ def test_what_is_said_cannot_become_markup(every_page: Path) -> None:
     page = every_page.read_text()
     assert "<title>A page &lt;of&gt; every block</title>" in page
     assert "<code>code</code> &amp; &lt;script&gt;alert(1)" in page
+    assert "Content-Security-Policy\" content=\"default-src 'none'" in page, "if something could"
 
 
 def test_pictures_have_no_ink_of_their_own(every_page: Path) -> None:
