@@ -11,8 +11,8 @@ policies; rollouts of another number of episodes are done again.
 
 `worth`, `staleness` and `size` run nothing. They draw what is in FOLDER: success against errors on
 recordings, a point a policy; success against what a pass of the model takes (tables `latency`,
-`before` and `many`); and success against the bytes of a VL row (tables `slots` and `bytes`). `pace`
-trains a few steps of each recipe of `size` in turn, and says how fast.
+`before` and `many`); and success against the bytes of a VL row (tables `slots`, `bytes` and `tuned
+tokens`). `pace` trains a few steps of each recipe of `size` in turn, and says how fast.
 
 The last line is JSON: of each row success with Wilson's interval over the rollouts of all seeds,
 and the errors in training std over all seeds and their differences from the table's first row
@@ -25,6 +25,7 @@ import os
 import sys
 import time
 from argparse import ArgumentParser, Namespace
+from collections import Counter
 from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextlib import ExitStack
@@ -72,7 +73,8 @@ _AS_IT_IS = (
 )
 """What a recipe or a rollout takes for granted, whatever params.yaml says."""
 _WRITE_PAGE = "pipeline.look.page.writing.write_report"
-_KEPT = tuple(dict.fromkeys((*TABLES["slots"].recipes, *TABLES["bytes"].recipes)))
+_SIZED = ("slots", "bytes", "tuned tokens")
+_KEPT = tuple(dict.fromkeys(name for table in _SIZED for name in TABLES[table].recipes))
 FIRST_SEED = 3_000_000
 """Of the rollouts; each seed of training has a thousand of its own."""
 
@@ -374,12 +376,7 @@ def _draw_staleness(wanted: Namespace) -> None:
 
 
 def _draw_size(wanted: Namespace) -> None:
-    """Success with its interval against the bytes of a row, a point for what is kept and read.
-
-    Squares are read by a pooler, triangles are of eight bits, hollow points have one training.
-    """
-    from pipeline.look.page import style
-
+    """Success with its interval against the bytes of a row, a point for what is kept and read."""
     points: dict[str, dict[str, Any]] = {}
     for name in _KEPT:
         folders = [_folder(wanted.out, name, seed) for seed in range(wanted.seeds)]
@@ -391,14 +388,25 @@ def _draw_size(wanted: Namespace) -> None:
             points[name] |= {"by_training": _by_training(folders, ON_TIME)}
     if not points:
         raise SystemExit(f"{wanted.out}: nothing to draw. Make the table `slots` there first.")
+    print(_draw_points(wanted.out, points))
+    print(json.dumps({"table": "size", "points": points}))
+
+
+def _draw_points(out: Path, points: dict[str, dict[str, Any]]) -> Path:
+    """Squares are read by a pooler, triangles have eight bits, hollow points have one training."""
+    from pipeline.look.page import style
 
     def draw() -> Any:
         figure, panels = style.panels(9.0, 4.4, 1, 1)
+        drawn: Counter[int] = Counter()
         for index, (name, point) in enumerate(points.items()):
+            row_bytes = point["row_bytes"]
+            place = row_bytes * 1.05 ** drawn[row_bytes]  # beside those of as many bytes
+            drawn[row_bytes] += 1
             rate, low, high = (100 * number for number in point["success"])
             marker = "s" if "pooler" in name else "^" if name in EIGHT_BITS else "o"
             panels.errorbar(
-                point["row_bytes"],
+                place,
                 rate,
                 [[rate - low], [high - rate]],
                 fmt=marker,
@@ -412,9 +420,8 @@ def _draw_size(wanted: Namespace) -> None:
         panels.legend(fontsize="small", loc="center left", bbox_to_anchor=(1.0, 0.5))
         return figure
 
-    (picture,) = style.write(wanted.out, {"success_bytes.png": draw})
-    print(picture)
-    print(json.dumps({"table": "size", "points": points}))
+    (picture,) = style.write(out, {"success_bytes.png": draw})
+    return picture
 
 
 def _race_training(out: Path) -> None:
