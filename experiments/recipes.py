@@ -194,6 +194,10 @@ _TICK = ("train_head.anchor=none",)
 _DIFFUSION = ("train_head.model_type=diffusion",)
 _FLOW_MATCHING = ("train_head.model_type=flow_matching",)
 _ONE_NOISE = ("train_head.diffusion.draws=1", "train_head.flow_matching.draws=1")
+_BRIEFLY = (
+    *("train_head.max_steps=200", "train_head.batch_size=16", "train_head.warmup_steps=20"),
+    "train_head.eval_every=50",
+)
 _LONGER = ("train_head.max_steps=2000", "train_head.eval_every=200")
 _300 = ("train_head.split.train=300",)
 
@@ -285,6 +289,8 @@ RECIPES = {
     # what sees
     "tuned model": Recipe(store="tuned"),
     "tuned tokens, pooler": Recipe(_POOLER, store="tuned tokens"),
+    # as many samples as the tuning sees
+    "tuned tokens, pooler, briefly": Recipe((*_POOLER, *_BRIEFLY), store="tuned tokens"),
     "larger images": Recipe(store="large"),
 }
 
@@ -348,6 +354,7 @@ TABLES = {
     "model": Table((AS_IT_IS, "tuned model")),
     "tuned tokens": Table(("tokens, pooler", "tuned tokens, pooler")),
     "live": Table(("tuned tokens, pooler",), (ON_TIME, "the policy it was tuned with")),
+    "briefly": Table(("tuned tokens, pooler, briefly",)),
     "images": Table((AS_IT_IS, "larger images")),
     "learning": Table((AS_IT_IS, "horizon 16", "not averaged")),
     "longer": Table(("four times as long", "flow matching, four times as long")),
