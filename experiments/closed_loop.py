@@ -398,20 +398,22 @@ def _draw_points(out: Path, points: dict[str, dict[str, Any]]) -> Path:
 
     def draw() -> Any:
         figure, panels = style.panels(9.0, 4.4, 1, 1)
-        drawn: Counter[int] = Counter()
-        for index, (name, point) in enumerate(points.items()):
+        colours = [*style.PALETTE, "#777777"]
+        drawn: Counter[int | str] = Counter()
+        for name, point in points.items():
             row_bytes = point["row_bytes"]
             place = row_bytes * 1.05 ** drawn[row_bytes]  # beside those of as many bytes
-            drawn[row_bytes] += 1
             rate, low, high = (100 * number for number in point["success"])
             marker = "s" if "pooler" in name else "^" if name in EIGHT_BITS else "o"
+            colour = colours[drawn[marker] % len(colours)]
+            drawn.update((row_bytes, marker))
             panels.errorbar(
                 place,
                 rate,
                 [[rate - low], [high - rate]],
                 fmt=marker,
                 fillstyle="full" if len(point["by_training"]) > 1 else "none",
-                color=style.PALETTE[index % len(style.PALETTE)],
+                color=colour,
                 label="mean, grid 4x4" if name == AS_IT_IS else name,
             )
         panels.set(xscale="log", xlabel="kB of a VL row's features", ylabel="inserted [%]")
