@@ -208,7 +208,7 @@ def _work(wanted: Namespace, name: str, seed: int, rollouts: tuple[str, ...]) ->
             evaluate.main(load_params(Path("params.yaml"), common))
         for way in rollouts:
             if not _is_done(wanted, folder / way):
-                said = [text.format(folder=folder) for text in ROLLOUTS[way]]
+                said = [text.format(folder=folder, out=wanted.out) for text in ROLLOUTS[way]]
                 told = [*common, *said, f"rollout.output={folder / way}"]
                 # Their pages take a tenth of the time; a row that surprises can be run again.
                 replaced = {_WRITE_PAGE: lambda *_: [], **PATCHES.get(way, {})}
@@ -393,7 +393,10 @@ def _draw_size(wanted: Namespace) -> None:
 
 
 def _draw_points(out: Path, points: dict[str, dict[str, Any]]) -> Path:
-    """Squares are read by a pooler, triangles have eight bits, hollow points have one training."""
+    """Write the picture of `size`.
+
+    Squares are read by a pooler, triangles have eight bits, hollow points have one training.
+    """
     from pipeline.look.page import style
 
     def draw() -> Any:

@@ -114,7 +114,7 @@ LATE = {f"{ms} ms": ms for ms in (100, 300, 600, 1000)}
 """Ways to roll out with a late model, and what a pass takes."""
 _NEWEST = "rollout.chunking=none"
 
-# {folder} stands for that of the policy.
+# {folder} stands for that of the policy, {out} for that of the experiments.
 ROLLOUTS: dict[str, tuple[str, ...]] = {
     ON_TIME: (),
     "depth": ("rollout.level=depth",),
@@ -131,7 +131,7 @@ ROLLOUTS: dict[str, tuple[str, ...]] = {
     **{f"{n} steps": (_NEWEST, f"rollout.execute={n}") for n in (2, 3, 4, 6, 8)},
     **{f"state {late}": () for late in LATE},
     "last weights": ("rollout.checkpoint={folder}/model/last",),
-    "the policy it was tuned with": ("rollout.checkpoint={folder}/../tuned-tokens/best",),
+    "the policy it was tuned with": ("rollout.checkpoint={out}/tuned-tokens/best",),
     "spoilt": (f"rollout.ablations={json.dumps(get_args(RolloutAblation))}",),
 }
 

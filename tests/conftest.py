@@ -16,7 +16,6 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import closing, redirect_stdout
-from ctypes.util import find_library
 from importlib.util import find_spec
 from io import StringIO
 from multiprocessing import forkserver, get_context
@@ -79,7 +78,9 @@ install_import_hook(
 )
 
 from pipeline.base.config import load_params
+from pipeline.base.errors import ConfigError
 from pipeline.simulation.insertion_formats import write_raw
+from pipeline.simulation.meta_world import MetaWorldEnvironment
 from pipeline.simulation.recorder import simulate_episode
 from pipeline.store import SCHEMA, FeatureStore, Sizes, StoreBuild, arrays, schema
 from pipeline.store.chunks import ChunkFiles, read_rows, row_checksums, write_seal
@@ -489,10 +490,10 @@ def meta_world(missing: Callable[[str], None]) -> None:
     """Meta-World, and what draws its frames."""
     if find_spec("metaworld") is None:
         pytest.skip("needs the extra `metaworld`")
-    other = "DISPLAY" in os.environ or torch.cuda.is_available()
-    drawing = os.environ.get("MUJOCO_GL", "other" if other else "osmesa")
-    if drawing == "osmesa" and find_library("OSMesa") is None:
-        missing("nothing draws Meta-World's frames: install OSMesa (Debian: libosmesa6)")
+    try:
+        MetaWorldEnvironment("hammer", image=64)
+    except ConfigError as error:
+        missing(str(error))
 
 
 # One a module, not one a session: while playwright runs, no other test can run an event loop.

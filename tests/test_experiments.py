@@ -24,7 +24,7 @@ def test_what_a_table_names_can_be_run(name: str, tmp_path: Path) -> None:
         steps = [text.format(out=tmp_path) for _, s in STORES[recipe.store].steps for text in s]
         load_params(PARAMS, steps)
         for rollout in table.rollouts:
-            said = [text.format(folder=tmp_path) for text in ROLLOUTS[rollout]]
+            said = [text.format(folder=tmp_path, out=tmp_path) for text in ROLLOUTS[rollout]]
             load_params(PARAMS, [*told, *said])
         with ExitStack() as patched:
             patched.enter_context(patch(closed_loop._WRITE_PAGE))

@@ -188,7 +188,7 @@ class MetaWorldEnvironment(RobotEnvironment):
 def _meta_world() -> Any:
     """The package's tables of tasks and experts.
 
-    Raises `ConfigError` where it is not installed.
+    Raises `ConfigError` where it is not installed, or where nothing draws that MuJoCo could load.
     """
     if not {"MUJOCO_GL", "DISPLAY"} & os.environ.keys():
         gpu = any(map(os.path.exists, ("/dev/dri", "/dev/nvidiactl")))
@@ -201,6 +201,8 @@ def _meta_world() -> Any:
             f"Meta-World is not installed ({error}): expected the package metaworld 3.1.1 or "
             "later. Install the extra: pip install 'vla-feature-cache[metaworld]'"
         ) from error
+    except Exception as error:  # MuJoCo loads what draws; each of its ways has errors of its own
+        raise _cannot_draw("Meta-World", error) from error
     return env_dict.ALL_V3_ENVIRONMENTS_GOAL_OBSERVABLE, policies.ENV_POLICY_MAP
 
 
@@ -233,11 +235,15 @@ def _renderer(name: str, image: int) -> Any:
     try:
         return mujoco.Renderer(_simulator(name).model, image, image)
     except Exception as error:  # each of its ways to draw has errors of its own
-        raise ConfigError(
-            f"metaworld:{name}: MuJoCo cannot draw frames with MUJOCO_GL="
-            f"{os.environ.get('MUJOCO_GL', '')}: {error}. Without a display it needs osmesa "
-            "(Debian: libosmesa6) or egl; set MUJOCO_GL before mujoco is imported"
-        ) from error
+        raise _cannot_draw(f"metaworld:{name}", error) from error
+
+
+def _cannot_draw(what: str, error: Exception) -> ConfigError:
+    return ConfigError(
+        f"{what}: MuJoCo cannot draw frames with MUJOCO_GL={os.environ.get('MUJOCO_GL', '')}: "
+        f"{error}. Without a display it needs osmesa (Debian: libosmesa6) or egl; set MUJOCO_GL "
+        "before mujoco is imported"
+    )
 
 
 atexit.register(_renderer.cache_clear)  # before the modules that a renderer needs to close

@@ -1,6 +1,7 @@
 """Meta-World's tasks as environments; most tests need the extra `metaworld`."""
 
 import sys
+from types import ModuleType
 
 import gymnasium
 import numpy as np
@@ -30,6 +31,16 @@ def play(environment: MetaWorldEnvironment, seed: int) -> np.ndarray:
 def test_a_missing_package_names_the_extra(monkeypatch):
     monkeypatch.setitem(sys.modules, "metaworld", None)
     with pytest.raises(ConfigError, match=r"vla-feature-cache\[metaworld\]"):
+        MetaWorldEnvironment("assembly")
+
+
+def test_nothing_that_draws_is_a_refusal_that_says_what_to_install(monkeypatch):
+    class Undrawn(ModuleType):
+        def __getattr__(self, name):
+            raise RuntimeError("no library")
+
+    monkeypatch.setitem(sys.modules, "metaworld", Undrawn("metaworld"))
+    with pytest.raises(ConfigError, match=r"cannot draw frames .*no library.* libosmesa6"):
         MetaWorldEnvironment("assembly")
 
 
