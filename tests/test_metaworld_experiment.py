@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from experiments.metaworld.recording import Record, demonstrate, record, seeds_of
+from experiments.sight import regressed
 from pipeline.base.config import Source
 from pipeline.base.errors import ConfigError
 from pipeline.data import open_recordings
@@ -49,6 +50,8 @@ def test_a_set_is_what_the_expert_did_and_is_recorded_once(tmp_path: Path) -> No
     camera = first.cameras()[VIEW]
     film = truth.films[f"observation.images.{VIEW}"]
     assert len(camera.time) == len(film)
+    shown = np.stack([*camera.read(range(len(film)))])
+    np.testing.assert_array_equal(shown, film, "a policy in the simulation sees these very pixels")
     before = (folder / "meta" / "info.json").stat().st_mtime_ns
     assert record(tmp_path, [asked], jobs=1) == [kept]
     assert (folder / "meta" / "info.json").stat().st_mtime_ns == before
@@ -111,6 +114,29 @@ def run_here(run: Any, monkeypatch: pytest.MonkeyPatch) -> None:
 
     monkeypatch.setattr(protocol, "ProcessPoolExecutor", Here)
     protocol.run_protocol(run)
+
+
+def test_a_regression_finds_places_in_rows_that_it_did_not_see() -> None:
+    features = np.random.default_rng(0).standard_normal((60, 3, 4)).astype(np.float32)
+    target = 10 * features[:, 1, :1].astype(float) + 5  # a single coordinate stays a column
+    told = regressed(features, target, slice(0, 40), slice(40, None))
+    np.testing.assert_allclose(told, target[40:], atol=1)
+
+
+@pytest.mark.usefixtures("meta_world")
+@pytest.mark.extra
+def test_sight_has_a_row_for_each_variant_beside_the_mean(tmp_path: Path) -> None:
+    from experiments.metaworld.protocol import Run
+    from experiments.metaworld.sight import write_sight
+
+    run = Run(tmp_path / "out", ("mean",), ("button-press-topdown-v3",))
+    table = write_sight(run, fitted=(4, 8), held=4)
+    blind, seen = table.rows
+    assert [blind[1], seen[1]] == ["places' mean", "mean"] and len({*blind[2:]}) == 1
+    kept = json.loads((run.out / "sight.json").read_text())
+    assert kept["fitted"] == [4, 8] and kept["median_error_mm"] == [[*row] for row in table.rows]
+    with pytest.raises(ConfigError, match="run the variant tuned first"):
+        write_sight(replace(run, variants=("tuned",)))
 
 
 def test_every_variant_gives_params_that_can_be_read(tmp_path: Path) -> None:

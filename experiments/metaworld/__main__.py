@@ -3,9 +3,10 @@
 python -m experiments.metaworld record [--tasks …] [--episodes N] [--seed N] --out FOLDER
 python -m experiments.metaworld run [VARIANT …] [--seeds N] [--checkpoint FOLDER] --out FOLDER
 python -m experiments.metaworld table --out FOLDER
+python -m experiments.metaworld sight [VARIANT …] --out FOLDER
 
 `run` records, extracts, trains and rolls out what is missing in the folder; `table` writes tables
-and a page of what is finished there.
+and a page of what is finished there; `sight` regresses the places of things from features.
 """
 
 import os
@@ -37,11 +38,17 @@ def main() -> int:
     one.set_defaults(run=_record)
     whole = commands.add_parser("run", help="policies and rollouts of the protocol")
     whole.add_argument("variants", nargs="*", default=["protocol"], metavar="VARIANT")
-    whole.add_argument("--checkpoint", help="a Qwen2.5-VL; the demo's random weights otherwise")
     whole.set_defaults(run=_protocol)
+    sight = commands.add_parser("sight", help="how well features tell where things are")
+    sight.add_argument("variants", nargs="+", metavar="VARIANT")
+    sight.set_defaults(run=_sight)
     table = commands.add_parser("table", help="tables of what is finished")
     table.set_defaults(run=_table)
-    for command in (whole, table):
+    for command in (whole, sight):
+        command.add_argument(
+            "--checkpoint", help="a Qwen2.5-VL; the demo's random weights otherwise"
+        )
+    for command in (whole, table, sight):
         command.add_argument("--tasks", nargs="+", default=[*INSTRUCTIONS])
         command.add_argument("--seeds", type=int, default=3)
         command.add_argument("--episodes", type=int, default=25, help="of each rollout")
@@ -83,6 +90,12 @@ def _table(wanted: Namespace) -> None:
     from experiments.metaworld.table import write_tables
 
     print(write_tables(_run(wanted)))
+
+
+def _sight(wanted: Namespace) -> None:
+    from experiments.metaworld.sight import write_sight
+
+    print(*write_sight(_run(wanted)).text(), sep="\n")
 
 
 def _run(wanted: Namespace) -> "Run":

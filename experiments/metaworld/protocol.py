@@ -162,18 +162,12 @@ class TrainedPolicy:
 
 def run_protocol(wanted: Run) -> None:
     """Do what is missing: recordings, model, stores, policies, rollouts."""
-    out = wanted.out
-    out.mkdir(parents=True, exist_ok=True)
-    _write_params(wanted)
+    prepare(wanted)
     asked = [
         Record(task=task, run=0, episodes=EPISODES, image=224, shadows=False)
         for task in wanted.tasks
     ]
-    record(out / "demonstrations", asked, wanted.jobs)
-    if wanted.checkpoint is None and not (out / "vlm").exists():
-        from pipeline.vlm.demo_checkpoint import write_demo_checkpoint
-
-        write_demo_checkpoint(out / "vlm")
+    record(wanted.out / "demonstrations", asked, wanted.jobs)
     missing = [policy for policy in wanted.policies() if not policy.done]
     if any(VARIANTS[policy.variant].tuned for policy in missing):
         _tune(wanted)
@@ -189,12 +183,13 @@ def run_protocol(wanted: Run) -> None:
         pool.shutdown(cancel_futures=True)
 
 
-def _write_params(wanted: Run) -> None:
-    """Write the params that all policies in the folder share.
+def prepare(wanted: Run) -> None:
+    """Write the params that all policies in the folder share, and the demo's model.
 
     Raises `ConfigError` where the folder was begun with others, whose policies would be mixed up
     with those of now.
     """
+    wanted.out.mkdir(parents=True, exist_ok=True)
     asked = {"checkpoint": wanted.checkpoint, "episodes": wanted.episodes}
     text = f"# run with {asked}\n" + _PARAMS.read_text(encoding="utf-8")
     text, file = text.replace("{out}", str(wanted.out)), wanted.out / "params.yaml"
@@ -204,6 +199,10 @@ def _write_params(wanted: Run) -> None:
             "another folder with --out"
         )
     file.write_text(text, encoding="utf-8")
+    if wanted.checkpoint is None and not (wanted.out / "vlm").exists():
+        from pipeline.vlm.demo_checkpoint import write_demo_checkpoint
+
+        write_demo_checkpoint(wanted.out / "vlm")
 
 
 def train_and_roll_out(policy: TrainedPolicy) -> None:

@@ -120,14 +120,23 @@ class MetaWorldEnvironment(RobotEnvironment):
         """Time since the beginning of the episode."""
         return self.ticks / HZ
 
+    @property
+    def drawn_mm(self) -> NDArray[np.float64]:
+        """What the episode's seed drew: places of object and goal. No policy is shown them."""
+        return self._simulator._last_rand_vec * 1000
+
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Readings, dict[str, Any]]:
         """Begin the episode of `seed`, or of a random seed if None."""
         super().reset(seed=seed)
+        import mujoco
+
         drawn = int(self.np_random.integers(2**31)) if seed is None else seed
         self._simulator.seed(drawn)
         self._seen, _ = self._simulator.reset()
+        # Meta-World moves peg and drawer without telling MuJoCo, which draws where they were.
+        mujoco.mj_forward(self._simulator.model, self._simulator.data)
         self.ticks, self.outcome = 0, None
         return self._readings(), {"success": False}
 

@@ -92,3 +92,12 @@ class TestMetaWorld(EnvironmentContract):
         rows, _ = np.nonzero(frame[..., 0].astype(int) - frame[..., 1:].max(axis=-1) > 60)
         assert rows.mean() > 24, "the red arm stands on the floor, below the grey background"
         assert np.ptp(frame[:8].astype(int)) < 40, "above it there is nothing"
+
+    def test_the_first_frame_is_of_this_episode(self):
+        first = []
+        for before in (0, 1):
+            environment = MetaWorldEnvironment("drawer-open", image=64)
+            for seed in (before, 2):
+                environment.reset(seed=seed)
+            first.append(environment.frames()[VIEW][1])
+        np.testing.assert_array_equal(*first)
