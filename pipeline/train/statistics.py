@@ -1,6 +1,6 @@
 """The normalisation, fitted on the training ticks alone."""
 
-from collections.abc import Generator, Iterable, Iterator, Sequence
+from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
@@ -96,8 +96,8 @@ def fit_normalization(
 def anchored_channels(store: FeatureStore, ticks: Ticks, params: TrainHeadParams) -> list[str]:
     """The action channels that `train_head.anchor` names; "auto" chooses by the training `ticks`.
 
-    It chooses translations that the state measures too; with a sensor, it leaves out those that
-    advance one way (`ONE_WAY`).
+    It chooses translations that the state measures too, and that the arm follows (`_followed`);
+    with a sensor, it leaves out those that advance one way (`ONE_WAY`).
     """
     if params.anchor != "auto":
         return [*params.anchor]
@@ -105,7 +105,7 @@ def anchored_channels(store: FeatureStore, ticks: Ticks, params: TrainHeadParams
     if not (params.anchored and known):
         return []
     action = store.streams["action"]
-    chosen = told_deltas(action, store.streams["state"])
+    chosen = _followed(store, ticks, told_deltas(action, store.streams["state"]))
     groups = action_groups(action["names"], action["units"])
     one_way = np.zeros(len(groups), bool)
     if params.sensor_enabled and _readings(store, ticks, "sensor"):
@@ -115,6 +115,34 @@ def anchored_channels(store: FeatureStore, ticks: Ticks, params: TrainHeadParams
         one_way = np.abs(net.mean(axis=0)) >= ONE_WAY * np.sqrt(np.square(net).mean(axis=0))
     channels = zip(action["names"], groups, one_way, strict=True)
     return [n for n, group, away in channels if n in chosen and group == "translation" and not away]
+
+
+def _followed(store: FeatureStore, ticks: Ticks, told: Mapping[str, int]) -> list[str]:
+    """The delta channels whose motion within a tick is its own action rather than the one before.
+
+    The motion is regressed on both actions, motion = p·own + q·before, and p must not be below q.
+    An arm that follows later than half a tick has the motion since a frame still before it: a
+    policy that subtracts what is measured sends it there again, and the arm swings.
+    """
+    columns = [store.streams["action"]["names"].index(name) for name in told]
+    action, time = store.array("tick/action"), store.array("tick/time")
+    values, read = store.array("state/values"), store.array("state/time")
+    starts, ends = store.array("episode/state_start"), store.array("tick/state_end")
+    episode = store.episode_of(ticks)
+    sums = np.zeros((5, len(told)))
+    for own in np.split(ticks, np.flatnonzero(np.diff(episode)) + 1):
+        readings = slice(int(starts[store.episode_of(own[:1])[0]]), int(ends[own[-1]]))
+        if readings.start == readings.stop:
+            continue
+        places = widen(values[readings])[:, [*told.values()]].T
+        moved = np.diff([np.interp(time[own], read[readings], place) for place in places])[:, 1:]
+        acted = widen(action[own])[:, columns].T.astype(np.float64)
+        now, before = acted[:, 1:-1], acted[:, :-2]
+        pairs = [(now, now), (before, before), (now, before), (now, moved), (before, moved)]
+        sums += [(left * right).sum(axis=1) for left, right in pairs]
+    nn, bb, nb, nm, bm = sums
+    follows = nm * (bb + nb) >= bm * (nn + nb)  # p >= q of the normal equations
+    return [name for name, kept in zip(told, follows, strict=True) if kept]
 
 
 def fit_relative(

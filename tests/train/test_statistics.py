@@ -141,6 +141,27 @@ def test_anchored_are_translations_that_go_either_way(
     assert anchored_channels(store, np.arange(store.ticks), params) == anchor
 
 
+@pytest.mark.parametrize(("late", "anchor"), [(0.3, ["dx"]), (0.7, []), (3, [])])
+def test_what_the_arm_follows_later_than_half_a_tick_is_not_anchored(
+    tiny_store, tmp_path, monkeypatch, late, anchor
+):
+    store = FeatureStore.open(tiny_store(tmp_path))
+    state = {"names": ["x", "y", "z", "gripper"], "units": ["mm", "", "", ""]}
+    monkeypatch.setattr(FeatureStore, "streams", store.streams | {"state": state})
+    ticks, time = np.arange(store.ticks), store.array("tick/time")
+    action, values, read = (
+        store.array(name) for name in ("tick/action", "state/values", "state/time")
+    )
+    starts, episode = store.array("episode/state_start"), store.episode_of(ticks)
+    for own in np.split(ticks, np.flatnonzero(np.diff(episode)) + 1):
+        rows = slice(starts[episode[own[0]]], store.array("tick/state_end")[own[-1]])
+        sent = np.concatenate([[0], np.cumsum(action[own, 0])[:-1]])
+        period = time[own[1]] - time[own[0]]
+        values[rows, 0] = np.interp(read[rows] - late * period, time[own], sent)
+    params = TrainHeadParams(sensor_enabled=False)
+    assert anchored_channels(store, ticks, params) == anchor
+
+
 def test_what_rested_in_training_is_no_unit_of_what_moves_later(tiny_store, tmp_path):
     store = FeatureStore.open(tiny_store(tmp_path))
     readings = store.array("state/values")
