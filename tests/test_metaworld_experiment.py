@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from experiments.metaworld.recording import Record, demonstrate, record, seeds_of
+from experiments.metaworld.recording import VERSION, Record, demonstrate, record, seeds_of
 from experiments.sight import regressed
 from pipeline.base.config import Source
 from pipeline.base.errors import ConfigError
@@ -32,7 +32,8 @@ def test_no_two_purposes_or_runs_share_an_episode() -> None:
 @pytest.mark.usefixtures("meta_world")
 @pytest.mark.extra
 def test_a_set_is_what_the_expert_did_and_is_recorded_once(tmp_path: Path) -> None:
-    asked = Record(task="button-press-topdown-v3", run=0, episodes=2, image=48, shadows=False)
+    task = "button-press-topdown-v3"
+    asked = Record(version=VERSION, task=task, run=0, episodes=2, image=48, shadows=False)
     (kept,) = record(tmp_path, [asked], jobs=1)
     assert len(kept.seeds) == 2 and {*kept.seeds} <= {*seeds_of("demonstrations", 0)}
     folder = tmp_path / asked.task
@@ -55,9 +56,10 @@ def test_a_set_is_what_the_expert_did_and_is_recorded_once(tmp_path: Path) -> No
     before = (folder / "meta" / "info.json").stat().st_mtime_ns
     assert record(tmp_path, [asked], jobs=1) == [kept]
     assert (folder / "meta" / "info.json").stat().st_mtime_ns == before
-    other = asked.model_copy(update={"episodes": 3})
-    with pytest.raises(ConfigError, match=r"record.json: .*episodes 2"):
-        record(tmp_path, [other], jobs=1)
+    for name, value in ("episodes", 3), ("version", 1):
+        found = f"record.json: .*{name} {getattr(asked, name)}"
+        with pytest.raises(ConfigError, match=found):
+            record(tmp_path, [asked.model_copy(update={name: value})], jobs=1)
 
 
 @pytest.mark.usefixtures("meta_world")
@@ -119,7 +121,8 @@ def run_here(run: Any, monkeypatch: pytest.MonkeyPatch) -> None:
 def test_a_regression_finds_places_in_rows_that_it_did_not_see() -> None:
     features = np.random.default_rng(0).standard_normal((60, 3, 4)).astype(np.float32)
     target = 10 * features[:, 1, :1].astype(float) + 5  # a single coordinate stays a column
-    told = regressed(features, target, slice(0, 40), slice(40, None))
+    known = np.where(np.arange(60)[:, None] < 40, target, np.nan)
+    told = regressed(features, known, slice(0, 40), slice(40, None))
     np.testing.assert_allclose(told, target[40:], atol=1)
 
 

@@ -3,7 +3,7 @@
 python -m experiments.metaworld record [--tasks …] [--episodes N] [--seed N] --out FOLDER
 python -m experiments.metaworld run [VARIANT …] [--seeds N] [--checkpoint FOLDER] --out FOLDER
 python -m experiments.metaworld table --out FOLDER
-python -m experiments.metaworld sight [VARIANT …] --out FOLDER
+python -m experiments.metaworld sight VARIANT … [--checkpoint FOLDER] --out FOLDER
 
 `run` records, extracts, trains and rolls out what is missing in the folder; `table` writes tables
 and a page of what is finished there; `sight` regresses the places of things from features.
@@ -15,7 +15,7 @@ from argparse import ArgumentParser, Namespace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from experiments.metaworld.recording import Record, record
+from experiments.metaworld.recording import VERSION, Record, record
 from pipeline.base.errors import ConfigError, PipelineError
 from pipeline.simulation.meta_world import INSTRUCTIONS, full_name
 
@@ -66,6 +66,7 @@ def main() -> int:
 def _record(wanted: Namespace) -> None:
     asked = [
         Record(
+            version=VERSION,
             task=full_name(task),
             run=wanted.seed,
             episodes=wanted.episodes,

@@ -23,7 +23,7 @@ from unittest.mock import patch
 import yaml
 from tqdm import tqdm
 
-from experiments.metaworld.recording import Record, record, seeds_of
+from experiments.metaworld.recording import VERSION, Record, record, seeds_of
 from pipeline.base.config import Params, load_params
 from pipeline.base.errors import ConfigError
 from pipeline.policy.checkpoint import find_policy, load_policy
@@ -70,6 +70,7 @@ VARIANTS: Final[dict[str, Variant]] = {
     "vision": Variant(features=(*_TOKENS, "vlm.layers=[vision]"), policy=_POOLER),
     "features off": Variant(policy=("train_head.features_enabled=false",)),
     "state off": Variant(policy=("train_head.robot_state_enabled=false", "train_head.anchor=none")),
+    "anchored": Variant(policy=("train_head.anchor=[dx, dy, dz]",)),
     "reuse 1": Variant(features=("data.vlm_reuse_count=1",)),
     "reuse 3": Variant(features=("data.vlm_reuse_count=3",)),
     "reuse 30": Variant(features=("data.vlm_reuse_count=30",)),
@@ -164,7 +165,7 @@ def run_protocol(wanted: Run) -> None:
     """Do what is missing: recordings, model, stores, policies, rollouts."""
     prepare(wanted)
     asked = [
-        Record(task=task, run=0, episodes=EPISODES, image=224, shadows=False)
+        Record(version=VERSION, task=task, run=0, episodes=EPISODES, image=224, shadows=False)
         for task in wanted.tasks
     ]
     record(wanted.out / "demonstrations", asked, wanted.jobs)
@@ -190,7 +191,7 @@ def prepare(wanted: Run) -> None:
     with those of now.
     """
     wanted.out.mkdir(parents=True, exist_ok=True)
-    asked = {"checkpoint": wanted.checkpoint, "episodes": wanted.episodes}
+    asked = {"checkpoint": wanted.checkpoint, "episodes": wanted.episodes, "recorder": VERSION}
     text = f"# run with {asked}\n" + _PARAMS.read_text(encoding="utf-8")
     text, file = text.replace("{out}", str(wanted.out)), wanted.out / "params.yaml"
     if file.exists() and file.read_text(encoding="utf-8") != text:

@@ -43,6 +43,8 @@ SEEDS: Final = 10_000
 _TRIED: Final = 4
 """Seeds that are tried for each demonstration wanted, at most."""
 RECORD: Final = "record.json"
+VERSION: Final = 2
+"""Of the recorder; a set of another is refused. 1 had lossy films and wrong first frames."""
 _SET: Final = OutputKind("a set of demonstrations", lambda folder: (folder / RECORD).is_file())
 _BORDER: Final = Border(ConfigError, "Remove the folder that it is in and record again.")
 
@@ -50,6 +52,8 @@ _BORDER: Final = Border(ConfigError, "Remove the folder that it is in and record
 class Record(Document):
     """The content of `record.json`."""
 
+    version: int = 1
+    """The `VERSION` that recorded it."""
     task: str
     run: int
     episodes: int

@@ -1,7 +1,8 @@
 """How well features tell where the things of a scene lie, by how many scenes a regression saw.
 
 A scene is the first frame of an episode that no demonstration and no rollout has. What its seed
-drew, the places of object or goal in the plane, is regressed from all slots of a variant.
+drew, the place of the object, of the goal, or both, is regressed from all slots of a variant. The
+arm is at rest there: features of a moving arm tell less.
 """
 
 import json
@@ -35,11 +36,11 @@ def write_sight(run: Run, fitted: Sequence[int] = FITTED, held: int = _HELD) -> 
     A row is a task and a variant; the first of a task sees nothing and says the mean place of the
     scenes that are fitted.
 
-    Raises `ConfigError` for a variant whose model is not there.
+    Raises `ConfigError` for a variant whose model is not there, and a task whose places are fixed.
     """
-    prepare(run)
     if any(VARIANTS[name].tuned for name in run.variants) and not (run.out / "tuned").exists():
         raise ConfigError(f"{run.out / 'tuned'}: no tuned model; run the variant tuned first")
+    prepare(run)
     seeds = seeds_of("validation", 0)[: max(fitted) + held]
     rows: list[tuple[str | float, ...]] = []
     told = slice(max(fitted), None)
@@ -49,6 +50,8 @@ def write_sight(run: Run, fitted: Sequence[int] = FITTED, held: int = _HELD) -> 
             frames, drawn = zip(*tqdm(shown, task, len(seeds), disable=None), strict=True)
             places = np.stack(drawn)
             places = places[:, places.std(axis=0) > _VARIES_MM]
+            if not places.size:
+                raise ConfigError(f"{task}: its seeds draw nothing that varies by {_VARIES_MM} mm")
             blind = np.median(_distance(places[told] - places[: max(fitted)].mean(axis=0)))
             rows.append((task, "places' mean", *[round(float(blind), 1)] * len(fitted)))
             for name in run.variants:

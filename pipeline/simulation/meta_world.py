@@ -122,7 +122,10 @@ class MetaWorldEnvironment(RobotEnvironment):
 
     @property
     def drawn_mm(self) -> NDArray[np.float64]:
-        """What the episode's seed drew: places of object and goal. No policy is shown them."""
+        """What the episode's seed drew, (3,) or (6,): the place of the object, the goal, or both.
+
+        In the frame of the table. No policy is shown it.
+        """
         return self._simulator._last_rand_vec * 1000
 
     def reset(
@@ -135,8 +138,11 @@ class MetaWorldEnvironment(RobotEnvironment):
         drawn = int(self.np_random.integers(2**31)) if seed is None else seed
         self._simulator.seed(drawn)
         self._seen, _ = self._simulator.reset()
-        # Meta-World moves peg and drawer without telling MuJoCo, which draws where they were.
+        # Meta-World moves peg and drawer last, without telling MuJoCo: frames and expert would see
+        # them elsewhere.
         mujoco.mj_forward(self._simulator.model, self._simulator.data)
+        now = self._simulator._prev_obs = self._simulator._get_curr_obs_combined_no_goal()
+        self._seen[: 2 * len(now)] = np.tile(now, 2)
         self.ticks, self.outcome = 0, None
         return self._readings(), {"success": False}
 

@@ -9,8 +9,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from pipeline.base.config import MediaLimits
+from pipeline.base.config import MediaLimits, Source
 from pipeline.base.errors import RecordingError
+from pipeline.data import open_recordings
+from pipeline.data.lerobot_writer import LeRobotRows, write_data_set
 from pipeline.data.video import VideoClip, VideoSpan, opened_video
 
 ENCODINGS = [
@@ -186,3 +188,12 @@ def test_frames_of_one_time_are_refused(tmp_path, write):
     path = write.video(tmp_path / "a.mkv", SHADES, 3000)  # Matroska counts milliseconds
     with pytest.raises(RecordingError, match=r"a\.mkv: frames \d and \d of view 'top' have the sa"):
         clip(path, 36).check([0])
+
+
+def test_a_lossless_film_gives_every_pixel_back(tmp_path):
+    frames = np.random.default_rng(0).integers(0, 256, (5, 48, 64, 3), np.uint8)
+    key, columns = "observation.images.side", {"timestamp": np.arange(5, dtype=np.float32) / 10}
+    columns |= {"action": np.zeros((5, 2), np.float32)}
+    write_data_set(tmp_path, [LeRobotRows(columns, {key: frames})], {}, "look", 10, lossless=True)
+    (opened,) = open_recordings([Source(name="s", path=str(tmp_path))]).recordings
+    np.testing.assert_array_equal([*opened.cameras()["side"].read(range(5))], frames)

@@ -186,7 +186,7 @@ def test_the_golden_run(undisturbed):
         pytest.fail(f"{GOLDEN.name} was missing and has been written: run the test again")
     golden = json.loads(GOLDEN.read_text())
     assert golden["trainer"] == TRAINER_VERSION, f"delete {GOLDEN.name} and run the test again"
-    changed = "other numbers: if that is meant, raise TRAINER_VERSION in pipeline/train/identity.py"
+    changed = "other numbers: if that is meant, raise TRAINER_VERSION in pipeline/train/run.py"
     assert found == golden["losses"].get(machine, found), changed
     for kept in golden["losses"].values():
         assert found == pytest.approx(kept, rel=1e-4), changed

@@ -206,8 +206,8 @@ class TrainHeadParams(Section):
     """Action channels that count from the arm's position at the time of the newest frame, such as
     `[dx, dy]`, so that what vision shows stays true when the model is late. They must be deltas
     whose motion is in the state. `auto` uses the translations among them that the arm follows
-    within half a tick in the training episodes; with a sensor, not those that always advance in
-    one direction, because the sensor sees how far. none: no channel."""
+    within half a tick on average, in the training episodes; with a sensor, not those that always
+    advance in one direction, because the sensor sees how far. none: no channel."""
     action_form: Literal["recorded", "relative"] = "recorded"
     """relative: absolute actions that the state measures too (`joint_1`, `x` or `pose_x`, in the
     same unit) are learned as differences from the state at the tick, with statistics of their own,
