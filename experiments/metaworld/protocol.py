@@ -69,7 +69,7 @@ VARIANTS: Final[dict[str, Variant]] = {
     "tokens": Variant(features=_TOKENS, policy=_POOLER),
     "vision": Variant(features=(*_TOKENS, "vlm.layers=[vision]"), policy=_POOLER),
     "features off": Variant(policy=("train_head.features_enabled=false",)),
-    "state off": Variant(policy=("train_head.robot_state_enabled=false", "train_head.anchor=none")),
+    "state off": Variant(policy=("train_head.robot_state_enabled=false",)),
     "anchored": Variant(policy=("train_head.anchor=[dx, dy, dz]",)),
     "reuse 1": Variant(features=("data.vlm_reuse_count=1",)),
     "reuse 3": Variant(features=("data.vlm_reuse_count=3",)),

@@ -136,13 +136,15 @@ class MetaWorldEnvironment(RobotEnvironment):
         import mujoco
 
         drawn = int(self.np_random.integers(2**31)) if seed is None else seed
-        self._simulator.seed(drawn)
-        self._seen, _ = self._simulator.reset()
+        simulator = self._simulator
+        simulator.seed(drawn)
+        seen, _ = simulator.reset()
         # Meta-World moves peg and drawer last, without telling MuJoCo: frames and expert would see
         # them elsewhere.
-        mujoco.mj_forward(self._simulator.model, self._simulator.data)
-        now = self._simulator._prev_obs = self._simulator._get_curr_obs_combined_no_goal()
-        self._seen[: 2 * len(now)] = np.tile(now, 2)
+        forward: Any = mujoco.mj_forward  # pyright: ignore[reportAttributeAccessIssue]
+        forward(simulator.model, simulator.data)
+        now = simulator._prev_obs = simulator._get_curr_obs_combined_no_goal()
+        self._seen = np.concatenate([now, now, seen[2 * len(now) :]])
         self.ticks, self.outcome = 0, None
         return self._readings(), {"success": False}
 

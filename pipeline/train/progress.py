@@ -14,7 +14,6 @@ from tqdm import tqdm
 from pipeline.base.config import TrainHeadParams
 from pipeline.base.text import duration, size
 from pipeline.policy.observation import PolicyShape
-from pipeline.policy.shape import told_deltas
 from pipeline.store import FeatureStore
 from pipeline.store.proofs import storage_note
 from pipeline.train.batches import Prefetch
@@ -136,12 +135,6 @@ def describe_data(
         lines.append(note)
     if anchored := shape.anchored(store.streams["action"]["names"]):
         lines.append(f"anchored at the newest frame: {', '.join(anchored)}")
-    elif params.anchor == "auto" and params.anchored and shape.state_dim:
-        told = told_deltas(store.streams["action"], store.streams["state"])
-        why = "the arm follows later than half a tick, or they turn, or advance one way"
-        lines += [f"not anchored: {', '.join(told)} ({why}); train_head.anchor may name them"][
-            : len(told)
-        ]
     if not len(split.test):
         lines.append("split: nothing is test, so nothing is left for stages.evaluate to report on")
     if split.note:

@@ -57,7 +57,7 @@ from pipeline.train.training_data import list_differences, source_of
 
 RUN, BEST, LAST = "run.json", "best", "last"
 TRAINER_WEIGHTS, TRAINER_DOCUMENT = "trainer.safetensors", "trainer.json"
-TRAINER_VERSION = 6
+TRAINER_VERSION = 5
 """Raise it with every change of code that changes the numbers of a run. It is part of the run's
 identity, so that no run is resumed by code with other numbers."""
 FREE_PARAMS = {

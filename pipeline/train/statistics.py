@@ -1,6 +1,6 @@
 """The normalisation, fitted on the training ticks alone."""
 
-from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Generator, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
@@ -35,12 +35,6 @@ CHUNK_BYTES = 64 * 2**20
 ONE_WAY = 0.9
 """A channel advances one way where the mean of its net motions in the episodes is at least this
 share of their root mean square."""
-_DELAY_TICKS = 8
-"""How many actions before a tick's own the motion in the tick is explained by."""
-_DELAY_EPISODES = 256
-"""The most training episodes, evenly spaced, that tell how late the arm follows."""
-_LEAST_SHARE = 1e-10
-"""Directions of the actions with less than this share of the largest tell nothing of the delay."""
 _STATE_TICKS = 16_384
 """The most training ticks whose windows give the statistics of the states."""
 _AT_ONCE = 1024
@@ -102,8 +96,8 @@ def fit_normalization(
 def anchored_channels(store: FeatureStore, ticks: Ticks, params: TrainHeadParams) -> list[str]:
     """The action channels that `train_head.anchor` names; "auto" chooses by the training `ticks`.
 
-    It chooses translations that the state measures too, and that the arm follows (`_followed`).
-    With a sensor it leaves out those that advance one way (`ONE_WAY`).
+    It chooses translations that the state measures too; with a sensor, it leaves out those that
+    advance one way (`ONE_WAY`).
     """
     if params.anchor != "auto":
         return [*params.anchor]
@@ -111,7 +105,7 @@ def anchored_channels(store: FeatureStore, ticks: Ticks, params: TrainHeadParams
     if not (params.anchored and known):
         return []
     action = store.streams["action"]
-    told = told_deltas(action, store.streams["state"])
+    chosen = told_deltas(action, store.streams["state"])
     groups = action_groups(action["names"], action["units"])
     one_way = np.zeros(len(groups), bool)
     if params.sensor_enabled and _readings(store, ticks, "sensor"):
@@ -120,42 +114,7 @@ def anchored_channels(store: FeatureStore, ticks: Ticks, params: TrainHeadParams
         np.add.at(net, episode, store.array("tick/action")[ticks])
         one_way = np.abs(net.mean(axis=0)) >= ONE_WAY * np.sqrt(np.square(net).mean(axis=0))
     channels = zip(action["names"], groups, one_way, strict=True)
-    chosen = [n for n, group, away in channels if group == "translation" and not away]
-    return _followed(store, ticks, {name: told[name] for name in chosen if name in told})
-
-
-def _followed(store: FeatureStore, ticks: Ticks, told: Mapping[str, int]) -> list[str]:
-    """The delta channels that the arm follows within half a tick on average.
-
-    The motion between two ticks is G·a(0) - C(1)·(a(0) - a(1)) - C(2)·(a(1) - a(2)) - …, with
-    a(j) the action j ticks before, fitted by least squares: the mean delay in ticks is the sum of
-    all C over G. Actions that are constant tell no delay; then a channel counts as followed.
-
-    If an arm is later, a part of what was commanded before the frame moves it after the frame. A
-    policy that subtracts the motion since the frame commands that part again, and the arm swings.
-    """
-    columns = [store.streams["action"]["names"].index(name) for name in told]
-    action, time = store.array("tick/action"), store.array("tick/time")
-    values, read = store.array("state/values"), store.array("state/time")
-    starts, ends = store.array("episode/state_start"), store.array("tick/state_end")
-    normal = np.zeros((len(told), _DELAY_TICKS + 1, _DELAY_TICKS + 2))
-    episodes = np.split(ticks, np.flatnonzero(np.diff(store.episode_of(ticks))) + 1)
-    for index in evenly(np.arange(len(episodes)), _DELAY_EPISODES):
-        own = episodes[index]
-        readings = slice(int(starts[store.episode_of(own[:1])[0]]), int(ends[own[-1]]))
-        if len(own) < _DELAY_TICKS + 2 or readings.start == readings.stop:
-            continue
-        acted = action[own][:, columns].astype(np.float64)
-        now = np.lib.stride_tricks.sliding_window_view(acted[:-1], _DELAY_TICKS + 1, axis=0)
-        now = now[..., ::-1]  # (tick, channel, ticks before)
-        terms = np.concatenate([now[..., :1], np.diff(now)], axis=-1)
-        for channel, column in enumerate(told.values()):
-            places = np.interp(time[own], read[readings], values[readings, column])
-            moved = np.diff(places)[_DELAY_TICKS:]
-            rows = terms[:, channel]
-            normal[channel] += rows.T @ np.column_stack([rows, moved])
-    fits = [np.linalg.lstsq(sums[:, :-1], sums[:, -1], _LEAST_SHARE)[0] for sums in normal]
-    return [name for name, fit in zip(told, fits, strict=True) if fit[1:].sum() <= fit[0] / 2]
+    return [n for n, group, away in channels if n in chosen and group == "translation" and not away]
 
 
 def fit_relative(

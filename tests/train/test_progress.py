@@ -94,14 +94,6 @@ def test_groups_that_were_cut_by_time_count_once(described):
     assert line.endswith("of 1 + 6 + 0 groups (6 in all, cut by time)")
 
 
-def test_what_auto_does_not_anchor_is_named(store, described, monkeypatch):
-    state = {"names": ["x", "y", "z", "gripper"], "units": ["mm"] * 4}
-    monkeypatch.setattr(type(store), "streams", store.streams | {"state": state})
-    (said,) = (line for line in described(np.arange(30)) if "anchored" in line)
-    assert said.startswith("not anchored: dx, dy, dz (the arm follows later than half a tick")
-    assert not any("anchored" in line for line in described(np.arange(30), anchor="none"))
-
-
 def test_a_lossy_store_is_named_with_the_proof(store, described, monkeypatch):
     train = np.arange(store.ticks)
     assert not any("stored in" in line for line in described(train))

@@ -1,7 +1,6 @@
 """The normalisation sees what training may see, once, and nothing else."""
 
 import re
-from collections.abc import Sequence
 from dataclasses import asdict
 
 import numpy as np
@@ -138,49 +137,8 @@ def test_anchored_are_translations_that_go_either_way(
     monkeypatch.setattr(FeatureStore, "streams", streams)
     action, episode = store.array("tick/action"), store.episode_of(np.arange(store.ticks))
     action[:, 0], action[:, 2] = np.where(episode % 2, 1.0, -1.0), 1.0
-    for column, place in (0, 0), (2, 1):
-        follow(store, column, place, [1])
     params = TrainHeadParams.model_validate(changed)
     assert anchored_channels(store, np.arange(store.ticks), params) == anchor
-
-
-@pytest.mark.parametrize(
-    ("answer", "anchor"),
-    [
-        ([0.7, 0.3], ["dx"]),
-        ([0.3, 0.7], []),
-        ([0, 0, 0, 1], []),
-        ([0.4 * 0.6**late for late in range(8)], []),  # a first-order lag of 1.5 ticks
-        ([-1], []),
-    ],
-)
-def test_what_the_arm_follows_later_than_half_a_tick_is_not_anchored(
-    tiny_store, tmp_path, monkeypatch, answer, anchor
-):
-    store = FeatureStore.open(tiny_store(tmp_path))
-    state = {"names": ["x", "y", "z", "gripper"], "units": ["mm", "", "", ""]}
-    monkeypatch.setattr(FeatureStore, "streams", store.streams | {"state": state})
-    follow(store, 0, 0, answer)
-    params = TrainHeadParams(sensor_enabled=False)
-    assert anchored_channels(store, np.arange(store.ticks), params) == anchor
-    state["names"][0] = "elbow"
-    assert anchored_channels(store, np.arange(store.ticks), params) == [], "no state tells of dx"
-
-
-def follow(store: FeatureStore, column: int, place: int, answer: Sequence[float]) -> None:
-    """Let a channel of the state follow a channel of the action.
-
-    `answer` is the share of an action that moves the arm in its own tick, in the next one, and so
-    on.
-    """
-    ticks, time = np.arange(store.ticks), store.array("tick/time")
-    values, read = store.array("state/values"), store.array("state/time")
-    starts, episode = store.array("episode/state_start"), store.episode_of(ticks)
-    for own in np.split(ticks, np.flatnonzero(np.diff(episode)) + 1):
-        rows = slice(starts[episode[own[0]]], store.array("tick/state_end")[own[-1]])
-        moved = np.convolve(store.array("tick/action")[own, column], [*answer, 0])
-        places = [0, *np.cumsum(moved)[: len(own) - 1]]
-        values[rows, place] = np.interp(read[rows], time[own], places)
 
 
 def test_what_rested_in_training_is_no_unit_of_what_moves_later(tiny_store, tmp_path):

@@ -205,9 +205,9 @@ class TrainHeadParams(Section):
     anchor: Literal["auto"] | tuple[str, ...] = "auto"
     """Action channels that count from the arm's position at the time of the newest frame, such as
     `[dx, dy]`, so that what vision shows stays true when the model is late. They must be deltas
-    whose motion is in the state. `auto` uses the translations among them that the arm follows
-    within half a tick on average, in the training episodes; with a sensor, not those that always
-    advance in one direction, because the sensor sees how far. none: no channel."""
+    whose motion is in the state. `auto` uses the translations among them; with a sensor, not
+    those that always advance in one direction in the training episodes, because the sensor sees
+    how far. none: no channel."""
     action_form: Literal["recorded", "relative"] = "recorded"
     """relative: absolute actions that the state measures too (`joint_1`, `x` or `pose_x`, in the
     same unit) are learned as differences from the state at the tick, with statistics of their own,
