@@ -139,8 +139,8 @@ def _record_set(
         moves = {"names": list(ACTION.names), "units": list(ACTION.units), "kind": "delta"}
         features = {"observation.state": units, "action": moves}
         task = instruction_of(wanted.task)
-        # A policy sees what is drawn: what a lossy film does to frames moved the places told by the
-        # features of random weights by 130 mm.
+        # A policy sees frames as they are drawn; features of random weights are sensitive to what a
+        # lossy film changes, even where an eye sees no difference.
         write_data_set(folder, kept(), features, task, HZ, "meta_world_sawyer", lossless=True)
         document = wanted.model_dump(mode="json") | {"seeds": seeds[True], "failed": seeds[False]}
         write_document(folder / RECORD, document)
