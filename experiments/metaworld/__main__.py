@@ -33,6 +33,7 @@ def main() -> int:
     one.add_argument("--seed", type=int, default=0, help="0 to 99; no two share an episode")
     one.add_argument("--image", type=int, default=224, help="height and width of frames")
     one.add_argument("--shadows", action="store_true", help="and reflections; takes longer")
+    one.add_argument("--noise", type=float, default=0.0, help="mm added to what is carried out")
     one.add_argument("--jobs", type=int, default=len(os.sched_getaffinity(0)))
     one.add_argument("--out", type=Path, required=True)
     one.set_defaults(run=_record)
@@ -72,6 +73,7 @@ def _record(wanted: Namespace) -> None:
             episodes=wanted.episodes,
             image=wanted.image,
             shadows=wanted.shadows,
+            noise_mm=wanted.noise,
         )
         for task in dict.fromkeys(wanted.tasks)
     ]

@@ -1,6 +1,6 @@
 """CortexBench's protocol with this project's pipeline: stores, policies and rollouts of a variant.
 
-    OUT/demonstrations/TASK     recorded sets
+    OUT/demonstrations/TASK     recorded sets; OUT/demonstrations-3-mm/TASK those with noise
     OUT/vlm                     the demo's model of random weights; any other with --checkpoint
     OUT/stores/VARIANT-TASK.zarr
     OUT/policies/VARIANT-TASK-SEED/{model, steps/STEP, rollout/STEP}
@@ -40,15 +40,22 @@ _PARAMS: Final = Path(__file__).with_name("params.yaml")
 
 @dataclass(frozen=True)
 class Variant:
-    """What differs from `params.yaml`; stores of variants with equal `features` are shared."""
+    """What differs from `params.yaml`; stores of variants with equal `rows` are shared."""
 
     features: tuple[str, ...] = ()
     policy: tuple[str, ...] = ()
     tuned: bool = False
     """Whether the model is tuned on all tasks first, and then frozen again."""
     joint: bool = False
+    noise_mm: float = 0.0
+    """Of the demonstrations; see `Record`."""
     evaluations: int = 1
     """How often a training is rolled out, at equal distances, the last time at its end."""
+
+    @property
+    def rows(self) -> tuple[object, ...]:
+        """What decides the rows of a store."""
+        return self.features, self.tuned, self.noise_mm
 
 
 _TOKENS: Final = (
@@ -71,6 +78,7 @@ VARIANTS: Final[dict[str, Variant]] = {
     "features off": Variant(policy=("train_head.features_enabled=false",)),
     "state off": Variant(policy=("train_head.robot_state_enabled=false",)),
     "anchored": Variant(policy=("train_head.anchor=[dx, dy, dz]",)),
+    "noise": Variant(noise_mm=3.0),
     "reuse 1": Variant(features=("data.vlm_reuse_count=1",)),
     "reuse 3": Variant(features=("data.vlm_reuse_count=3",)),
     "reuse 30": Variant(features=("data.vlm_reuse_count=30",)),
@@ -124,9 +132,8 @@ class TrainedPolicy:
     @property
     def store(self) -> Path:
         """Its store, which policies with the same features share."""
-        own = VARIANTS[self.variant]
-        features = own.features, own.tuned
-        same = (name for name, v in VARIANTS.items() if (v.features, v.tuned) == features)
+        own = VARIANTS[self.variant].rows
+        same = (name for name, variant in VARIANTS.items() if variant.rows == own)
         return self.run.out / "stores" / f"{_slug(next(same))}-{self.task}.zarr"
 
     def params(self, *settings: str) -> Params:
@@ -137,6 +144,7 @@ class TrainedPolicy:
         told += [f"vlm.checkpoint={run.checkpoint}"] if run.checkpoint else []
         told += [f"vlm.adapter={run.out / 'tuned' / 'best' / 'adapter'}"] if variant.tuned else []
         told += [
+            f"data.root={_demonstrations(run, variant.noise_mm)}",
             f"extract.store={self.store}",
             f"train_head.seed={self.seed}",
             f"train_head.split={{val: 0.1, test: 0.05, seed: {self.seed}}}",
@@ -164,11 +172,20 @@ class TrainedPolicy:
 def run_protocol(wanted: Run) -> None:
     """Do what is missing: recordings, model, stores, policies, rollouts."""
     prepare(wanted)
-    asked = [
-        Record(version=VERSION, task=task, run=0, episodes=EPISODES, image=224, shadows=False)
-        for task in wanted.tasks
-    ]
-    record(wanted.out / "demonstrations", asked, wanted.jobs)
+    for noise_mm in sorted({VARIANTS[name].noise_mm for name in wanted.variants}):
+        asked = [
+            Record(
+                version=VERSION,
+                task=task,
+                run=0,
+                episodes=EPISODES,
+                image=224,
+                shadows=False,
+                noise_mm=noise_mm,
+            )
+            for task in wanted.tasks
+        ]
+        record(_demonstrations(wanted, noise_mm), asked, wanted.jobs)
     missing = [policy for policy in wanted.policies() if not policy.done]
     if any(VARIANTS[policy.variant].tuned for policy in missing):
         _tune(wanted)
@@ -244,6 +261,10 @@ def _tune(wanted: Run) -> None:
         told = f"finetune.output={tuned}", f"finetune.logs={wanted.out / 'tuning'}"
         extract.main(joint.params())
         finetune.main(joint.params(*told))
+
+
+def _demonstrations(run: Run, noise_mm: float) -> Path:
+    return run.out / (f"demonstrations-{noise_mm:g}-mm" if noise_mm else "demonstrations")
 
 
 def _slug(name: str) -> str:

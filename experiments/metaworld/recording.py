@@ -59,6 +59,9 @@ class Record(Document):
     episodes: int
     image: int
     shadows: bool
+    noise_mm: float = 0.0
+    """Spread of what is added to each motion that is carried out, not to the one that is kept, so
+    that demonstrations show how to come back (Laskey et al. 2017, "DART")."""
     seeds: tuple[int, ...] = ()
     failed: tuple[int, ...] = ()
     """Seeds whose episodes the expert failed; they are not in the set."""
@@ -152,6 +155,7 @@ def demonstrate(wanted: Record, seed: int) -> Demonstration:
     """One episode of the scripted expert, with a frame of each step."""
     environment = MetaWorldEnvironment(wanted.task, wanted.image, wanted.shadows)
     readings, _ = environment.reset(seed=seed)
+    noise = np.random.default_rng(seed)
     states: list[NDArray[np.float32]] = []
     actions: list[NDArray[np.float32]] = []
     frames: list[NDArray[np.uint8]] = []
@@ -159,7 +163,8 @@ def demonstrate(wanted: Record, seed: int) -> Demonstration:
         states.append(readings["state"][0])
         actions.append(environment.expert_action())
         frames.append(environment.frames()[VIEW][1])
-        readings, *_ = environment.step(actions[-1])
+        pushed = wanted.noise_mm * noise.standard_normal(3)
+        readings, *_ = environment.step(actions[-1] + np.append(pushed, 0.0))
     columns = {
         "observation.state": np.stack(states),
         "action": np.stack(actions),
