@@ -131,7 +131,7 @@ class TrainedPolicy:
 
     @property
     def store(self) -> Path:
-        """Its store, which policies with the same features share."""
+        """Its store, which policies of equal `rows` share."""
         own = VARIANTS[self.variant].rows
         same = (name for name, variant in VARIANTS.items() if variant.rows == own)
         return self.run.out / "stores" / f"{_slug(next(same))}-{self.task}.zarr"
