@@ -16,6 +16,7 @@ from pipeline.base.config import Source
 from pipeline.base.errors import ConfigError
 from pipeline.data import open_recordings
 from pipeline.simulation.meta_world import HZ, VIEW, instruction_of
+from pipeline.store.reader import FeatureStore
 
 
 def test_no_two_purposes_or_runs_share_an_episode() -> None:
@@ -95,7 +96,12 @@ def test_the_protocol_goes_from_demonstrations_to_a_table(tmp_path, monkeypatch,
     assert one.task == tasks[0] and {len(ended) for ended in one.successes.values()} == {1}
     capsys.readouterr()
     assert write_tables(run).exists()
-    table = json.loads((run.out / "tables.json").read_text())["variants"]["features off"]
+    tables = json.loads((run.out / "tables.json").read_text())
+    made = {part: made for part, (made, *_) in tables["parts"].items()}
+    assert made["recorded episodes"] == 3 and made["policies"] == 1, "what is there is not made"
+    store = FeatureStore.open(policy.store)
+    assert 0 < made["extracted rows"] <= len(store.array("vl/features"))
+    table = tables["variants"]["features off"]
     assert list(table) == [*tasks, "mean of 1"] and table["mean of 1"][-2:] == [1, 1]
     assert "features off" in capsys.readouterr().out
 

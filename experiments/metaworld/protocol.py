@@ -4,15 +4,17 @@
     OUT/vlm                     the demo's model of random weights; any other with --checkpoint
     OUT/stores/VARIANT-TASK.zarr
     OUT/policies/VARIANT-TASK-SEED/{model, steps/STEP, rollout/STEP}
+    OUT/parts.csv               how long each part of a run took, and how many it did
 
 What is done already is not done again, so a run that was stopped goes on.
 """
 
 import os
 import shutil
-from collections.abc import Iterator
+import time
+from collections.abc import Generator, Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from contextlib import redirect_stdout
+from contextlib import contextmanager, redirect_stdout
 from dataclasses import dataclass
 from itertools import product
 from multiprocessing import get_context
@@ -26,15 +28,18 @@ from tqdm import tqdm
 from experiments.metaworld.recording import VERSION, Record, record, seeds_of
 from pipeline.base.config import Params, load_params
 from pipeline.base.errors import ConfigError
+from pipeline.extract.run import extract
 from pipeline.policy.checkpoint import find_policy, load_policy
 from pipeline.simulation.meta_world import INSTRUCTIONS
 from pipeline.train.loop import Trainer
-from stages import extract, finetune, rollout, train_head
+from stages import finetune, rollout, train_head
 
 EPISODES: Final = 31
 """Demonstrations of a task: the split leaves 25 to 29 to train on; the protocol has 25."""
 JOINT: Final = "all"
 """In place of a task: one policy for all five."""
+PARTS: Final = "parts.csv"
+"""Lines of part, seconds of wall clock, and how many episodes, rows or policies it made."""
 _PARAMS: Final = Path(__file__).with_name("params.yaml")
 
 
@@ -77,6 +82,7 @@ VARIANTS: Final[dict[str, Variant]] = {
     "vision": Variant(features=(*_TOKENS, "vlm.layers=[vision]"), policy=_POOLER),
     "features off": Variant(policy=("train_head.features_enabled=false",)),
     "state off": Variant(policy=("train_head.robot_state_enabled=false",)),
+    "feature history 3": Variant(policy=("train_head.feature_history=3",)),
     "anchored": Variant(policy=("train_head.anchor=[dx, dy, dz]",)),
     "noise": Variant(noise_mm=3.0),
     "reuse 1": Variant(features=("data.vlm_reuse_count=1",)),
@@ -172,31 +178,19 @@ class TrainedPolicy:
 def run_protocol(wanted: Run) -> None:
     """Do what is missing: recordings, model, stores, policies, rollouts."""
     prepare(wanted)
-    for noise_mm in sorted({VARIANTS[name].noise_mm for name in wanted.variants}):
-        asked = [
-            Record(
-                version=VERSION,
-                task=task,
-                run=0,
-                episodes=EPISODES,
-                image=224,
-                shadows=False,
-                noise_mm=noise_mm,
-            )
-            for task in wanted.tasks
-        ]
-        record(_demonstrations(wanted, noise_mm), asked, wanted.jobs)
+    _record(wanted)
     missing = [policy for policy in wanted.policies() if not policy.done]
     if any(VARIANTS[policy.variant].tuned for policy in missing):
         _tune(wanted)
-    for policy in {policy.store: policy for policy in missing}.values():
-        extract.main(policy.params())
+    _extract(wanted, {policy.store: policy for policy in missing}.values())
     os.environ.setdefault("OMP_NUM_THREADS", str(max(1, (os.cpu_count() or 1) // wanted.jobs)))
     pool = ProcessPoolExecutor(wanted.jobs, get_context("spawn"), max_tasks_per_child=1)
     try:
-        begun = [pool.submit(train_and_roll_out, policy) for policy in missing]
-        for ended in tqdm(as_completed(begun), "policies", len(begun), unit="policy", disable=None):
-            ended.result()
+        with _timed(wanted.out, "policies") as made:
+            begun = [pool.submit(train_and_roll_out, policy) for policy in missing]
+            ends = tqdm(as_completed(begun), "policies", len(begun), unit="policy", disable=None)
+            for ended in ends:
+                made.append(ended.result())
     finally:  # what is under way may end, nothing more begins
         pool.shutdown(cancel_futures=True)
 
@@ -223,10 +217,49 @@ def prepare(wanted: Run) -> None:
         write_demo_checkpoint(wanted.out / "vlm")
 
 
-def train_and_roll_out(policy: TrainedPolicy) -> None:
+@contextmanager
+def _timed(out: Path, part: str) -> Generator[list[int]]:
+    """Note how long a part took, also when it is stopped; the caller appends what it made."""
+    made, begun = list[int](), time.perf_counter()
+    try:
+        yield made
+    finally:
+        with (out / PARTS).open("a", encoding="utf-8") as file:
+            file.write(f"{part},{time.perf_counter() - begun:.1f},{sum(made)}\n")
+
+
+def _record(wanted: Run) -> None:
+    for noise_mm in sorted({VARIANTS[name].noise_mm for name in wanted.variants}):
+        asked = [
+            Record(
+                version=VERSION,
+                task=task,
+                run=0,
+                episodes=EPISODES,
+                image=224,
+                shadows=False,
+                noise_mm=noise_mm,
+            )
+            for task in wanted.tasks
+        ]
+        folder = _demonstrations(wanted, noise_mm)
+        with _timed(wanted.out, "recorded episodes") as made:
+            missing = [one for one in asked if not (folder / one.task).exists()]
+            record(folder, asked, wanted.jobs)
+            made.append(EPISODES * len(missing))
+
+
+def _extract(wanted: Run, policies: Iterable[TrainedPolicy]) -> None:
+    with _timed(wanted.out, "extracted rows") as made:
+        for policy in policies:
+            if (report := extract(policy.params(), say=print)) is not None:
+                made.append(report.computed)
+
+
+def train_and_roll_out(policy: TrainedPolicy) -> int:
     """Train a policy, keep its checkpoints, and roll out those and the one that val chose.
 
-    What the stages print stands in a file beside its folder.
+    Returns 1, one policy made. What the stages print stands in a file beside its folder.
     """
     policy.folder.mkdir(parents=True, exist_ok=True)
     with policy.folder.with_suffix(".log").open("a") as log, redirect_stdout(log):
@@ -235,6 +268,7 @@ def train_and_roll_out(policy: TrainedPolicy) -> None:
             if not (folder / "report.html").exists():
                 told = f"rollout.checkpoint={policy.steps / str(step)}", f"rollout.output={folder}"
                 rollout.main(policy.params(*told))
+    return 1
 
 
 def _train(policy: TrainedPolicy) -> None:
@@ -259,8 +293,10 @@ def _tune(wanted: Run) -> None:
     joint, tuned = TrainedPolicy(wanted, "one policy", JOINT, 0), wanted.out / "tuned"
     if not tuned.exists():
         told = f"finetune.output={tuned}", f"finetune.logs={wanted.out / 'tuning'}"
-        extract.main(joint.params())
-        finetune.main(joint.params(*told))
+        _extract(wanted, [joint])
+        with _timed(wanted.out, "tuned models") as made:
+            finetune.main(joint.params(*told))
+            made.append(1)
 
 
 def _demonstrations(run: Run, noise_mm: float) -> Path:

@@ -11,7 +11,7 @@ from typing import Any, Final
 import numpy as np
 from matplotlib.figure import Figure
 
-from experiments.metaworld.protocol import VARIANTS, Run, TrainedPolicy
+from experiments.metaworld.protocol import PARTS, VARIANTS, Run, TrainedPolicy
 from pipeline.base.text import Table
 from pipeline.evaluate.rollouts import SuccessRate, error_bars
 from pipeline.look.page.blocks import Picture, Report, Section, Text
@@ -89,6 +89,20 @@ def _row(label: str, policies: Sequence[Judged]) -> tuple[Any, ...]:
     return (label, best, *rates, len(policies), len(last))
 
 
+def parts_table(out: Path) -> Table:
+    """What the parts of all runs in the folder made, and the wall clock that they took."""
+    parts, file = dict[str, list[float]](), out / PARTS
+    lines = file.read_text(encoding="utf-8").splitlines() if file.exists() else []
+    for part, *told in csv.reader(lines):
+        whole = parts.setdefault(part, [0.0, 0.0])
+        parts[part] = [have + float(more) for have, more in zip(whole, told, strict=True)]
+    rows = [
+        (part, int(made), f"{seconds / 3600:.2f}", f"{seconds / made:.3g}" if made else "-")
+        for part, (seconds, made) in parts.items()
+    ]
+    return Table(("part", "made", "hours", "seconds each"), rows, "Wall clock of the parts")
+
+
 def write_tables(run: Run) -> Path:
     """Write page and `tables.json`; returns the page. Only finished policies count."""
     policies = judged(run)
@@ -99,10 +113,16 @@ def write_tables(run: Run) -> Path:
     }
     tables = [success_table(name, own) for name, own in by_variant.items()]
     beside = Table(("encoder", "best"), list(PUBLISHED.items()), "CortexBench, published")
-    for table in tables:
+    parts = parts_table(run.out)
+    for table in (*tables, parts):
         print(table.caption, *table.text(), sep="\n")
     figures = {name: {row[0]: row[1:] for row in t.rows} for name, t in zip(by_variant, tables)}  # noqa: B905
-    content = {"published": PUBLISHED, "episodes": run.episodes, "variants": figures}
+    content = {
+        "published": PUBLISHED,
+        "episodes": run.episodes,
+        "variants": figures,
+        "parts": {row[0]: row[1:] for row in parts.rows},
+    }
     (run.out / "tables.json").write_text(json.dumps(content, indent=1), encoding="utf-8")
     picture = Picture(
         "success", "The last checkpoint, with 95 % intervals.", partial(_draw, by_variant)
@@ -118,6 +138,7 @@ def write_tables(run: Run) -> Path:
         [],
         (
             Section("Success", [Text(_RULES), *pictures, *tables, beside]),
+            Section("What it took", [parts]),
             Section("Films", [Text(f"Each policy's page is in {run.out / 'policies'}.")]),
         ),
     )
