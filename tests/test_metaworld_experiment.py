@@ -10,7 +10,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from experiments.metaworld import protocol
+from experiments.metaworld.protocol import VARIANTS, Run, TrainedPolicy, found_policies
 from experiments.metaworld.recording import VERSION, Record, demonstrate, record, seeds_of
+from experiments.metaworld.sight import write_sight
+from experiments.metaworld.table import Judged, judged, overview, success_table, write_tables
 from experiments.sight import regressed
 from pipeline.base.config import Source
 from pipeline.base.errors import ConfigError
@@ -34,13 +38,13 @@ def test_no_two_purposes_or_runs_share_an_episode() -> None:
 @pytest.mark.extra
 def test_a_set_is_what_the_expert_did_and_is_recorded_once(tmp_path: Path) -> None:
     task = "button-press-topdown-v3"
-    asked = Record(version=VERSION, task=task, run=0, episodes=2, image=48, shadows=False)
+    asked = Record(version=VERSION, task=task, run=0, episodes=2, image=48)
     (kept,) = record(tmp_path, [asked], jobs=1)
     assert len(kept.seeds) == 2 and {*kept.seeds} <= {*seeds_of("demonstrations", 0)}
     folder = tmp_path / asked.task
     opened = open_recordings([Source(name="s", path=str(folder))]).recordings
     assert len(opened) == 2
-    _, truth = demonstrate(asked, kept.seeds[0])
+    truth = demonstrate(asked, kept.seeds[0])
     assert truth is not None
     first = opened[0]
     action, state = first.action(), first.state()
@@ -67,12 +71,11 @@ def test_a_set_is_what_the_expert_did_and_is_recorded_once(tmp_path: Path) -> No
 @pytest.mark.extra
 def test_the_protocol_goes_from_demonstrations_to_a_table(tmp_path, monkeypatch, capsys):
     """Tiny: three demonstrations of one task, six steps, rollouts of one episode."""
-    from experiments.metaworld import protocol
-    from experiments.metaworld.table import judged, write_tables
 
     monkeypatch.setattr(protocol, "EPISODES", 3)
-    blind = replace(protocol.VARIANTS["features off"], evaluations=3)
-    monkeypatch.setitem(protocol.VARIANTS, "features off", blind)
+    blind = VARIANTS["features off"]
+    blind = replace(blind, policy=(*blind.policy, "train_head.keep_every=2"))
+    monkeypatch.setitem(VARIANTS, "features off", blind)
     monkeypatch.setattr("pipeline.simulation.meta_world.MAX_TICKS", 60)
     small = {"max_steps: 1500": "max_steps: 6", "eval_every: 250": "eval_every: 3"}
     text = protocol._PARAMS.read_text(encoding="utf-8")
@@ -85,17 +88,17 @@ def test_the_protocol_goes_from_demonstrations_to_a_table(tmp_path, monkeypatch,
     run = protocol.Run(tmp_path / "out", ("features off",), tasks, seeds=1, episodes=1)
     run_here(run, monkeypatch)
     (policy,) = run.policies()
-    assert policy.done and {2, 4, 6} <= set(policy.rollouts())
-    assert (policy.folder / "rollout" / "6" / "report.html").exists()
+    assert policy.done and {2, 4, 6} <= {*policy.checkpoints}
+    assert (policy.rollout(6) / "report.html").exists()
     before = {p: p.stat().st_mtime_ns for p in policy.folder.rglob("*") if p.is_file()}
     run_here(run, monkeypatch)
     assert before == {p: p.stat().st_mtime_ns for p in policy.folder.rglob("*") if p.is_file()}
     with pytest.raises(ConfigError, match="found those of another run"):
         run_here(replace(run, episodes=2), monkeypatch)
-    (one,) = judged(run)
+    (one,) = judged(run.out)
     assert one.task == tasks[0] and {len(ended) for ended in one.successes.values()} == {1}
     capsys.readouterr()
-    assert write_tables(run).exists()
+    assert write_tables(run.out).exists()
     tables = json.loads((run.out / "tables.json").read_text())
     made = {part: made for part, (made, *_) in tables["parts"].items()}
     assert made["recorded episodes"] == 3 and made["policies"] == 1, "what is there is not made"
@@ -106,9 +109,29 @@ def test_the_protocol_goes_from_demonstrations_to_a_table(tmp_path, monkeypatch,
     assert "features off" in capsys.readouterr().out
 
 
+def test_a_mean_has_only_trainings_that_are_finished_for_every_task(tmp_path: Path) -> None:
+
+    def one(task: str, seed: int, success: list[bool]) -> Judged:
+        policy = TrainedPolicy(Run(tmp_path, ("reuse 3",)), "reuse 3", task, seed)
+        policy.folder.mkdir(parents=True)
+        return Judged(policy, task, {4: success, 8: success}, 8)
+
+    both = [one("hammer-v3", 0, [True, True]), one("drawer-open-v3", 0, [False, False])]
+    policies = [*both, one("hammer-v3", 1, [True, True])]
+    assert {(p.variant, p.task, p.seed) for p in found_policies(tmp_path)} == {
+        ("reuse 3", p.task, p.policy.seed) for p in policies
+    }
+    hammer, drawer, mean = success_table("reuse 3", policies).rows
+    assert hammer[-2:] == (2, 4) and drawer[-2:] == (1, 2)
+    assert mean[0] == "mean of 2" and mean[1] == "50.0" and mean[-2:] == (2, 4)
+    elsewhere = [one("assembly-v3", 0, [True])]
+    rows = {row[0]: row[1:] for row in overview({"a": policies, "b": elsewhere}).rows}
+    assert rows["a"][:3] == ("100%", "0%", "") and rows["a"][-1] == ""
+    assert overview({"a": policies}).rows[0][-1].startswith("50%")
+
+
 def run_here(run: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     """`run_protocol` without processes of its own, which would not see what is replaced here."""
-    from experiments.metaworld import protocol
 
     class Here:
         def __init__(self, *_: object, **__: object) -> None: ...
@@ -135,8 +158,6 @@ def test_a_regression_finds_places_in_rows_that_it_did_not_see() -> None:
 @pytest.mark.usefixtures("meta_world")
 @pytest.mark.extra
 def test_sight_has_a_row_for_each_variant_beside_the_mean(tmp_path: Path) -> None:
-    from experiments.metaworld.protocol import Run
-    from experiments.metaworld.sight import write_sight
 
     run = Run(tmp_path / "out", ("mean",), ("button-press-topdown-v3",))
     table = write_sight(run, fitted=(4, 8), held=4)
@@ -149,9 +170,7 @@ def test_sight_has_a_row_for_each_variant_beside_the_mean(tmp_path: Path) -> Non
 
 
 def test_every_variant_gives_params_that_can_be_read(tmp_path: Path) -> None:
-    from experiments.metaworld.protocol import _PARAMS, VARIANTS, Run
-
-    text = _PARAMS.read_text(encoding="utf-8").replace("{out}", str(tmp_path))
+    text = protocol._PARAMS.read_text(encoding="utf-8").replace("{out}", str(tmp_path))
     (tmp_path / "params.yaml").write_text(text, encoding="utf-8")
     policies = [*Run(tmp_path, tuple(VARIANTS), seeds=2).policies()]
     assert len({policy.folder for policy in policies}) == len(policies)

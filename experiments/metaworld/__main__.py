@@ -6,7 +6,8 @@ python -m experiments.metaworld table --out FOLDER
 python -m experiments.metaworld sight VARIANT … [--checkpoint FOLDER] --out FOLDER
 
 `run` records, extracts, trains and rolls out what is missing in the folder; `table` writes tables
-and a page of what is finished there; `sight` regresses the places of things from features.
+and a page of what is finished there; `sight` regresses the places of things from features. With a
+checkpoint, give `--set vlm.dtype=bfloat16` and the size of the frames too; `--jobs 1` on a GPU.
 """
 
 import os
@@ -28,14 +29,11 @@ def main() -> int:
     parser = ArgumentParser("experiments.metaworld", description=(__doc__ or "").split("\n")[0])
     commands = parser.add_subparsers(required=True)
     one = commands.add_parser("record", help="record scripted demonstrations, one set a task")
-    one.add_argument("--tasks", nargs="+", default=[*INSTRUCTIONS])
     one.add_argument("--episodes", type=int, default=25, help="of each task, all successful")
     one.add_argument("--seed", type=int, default=0, help="0 to 99; no two share an episode")
     one.add_argument("--image", type=int, default=224, help="height and width of frames")
     one.add_argument("--shadows", action="store_true", help="and reflections; takes longer")
-    one.add_argument("--noise", type=float, default=0.0, help="mm added to what is carried out")
-    one.add_argument("--jobs", type=int, default=len(os.sched_getaffinity(0)))
-    one.add_argument("--out", type=Path, required=True)
+    one.add_argument("--noise", type=float, default=0.0, help="mm, added to each motion")
     one.set_defaults(run=_record)
     whole = commands.add_parser("run", help="policies and rollouts of the protocol")
     whole.add_argument("variants", nargs="*", default=["protocol"], metavar="VARIANT")
@@ -45,15 +43,17 @@ def main() -> int:
     sight.set_defaults(run=_sight)
     table = commands.add_parser("table", help="tables of what is finished")
     table.set_defaults(run=_table)
+    whole.add_argument("--seeds", type=int, default=3, help="trainings of each variant")
+    whole.add_argument("--episodes", type=int, default=25, help="of each rollout")
     for command in (whole, sight):
         command.add_argument(
             "--checkpoint", help="a Qwen2.5-VL; the demo's random weights otherwise"
         )
-    for command in (whole, table, sight):
+        command.add_argument("--set", action="append", default=[], metavar="KEY=VALUE")
+    for command in (one, whole, sight):
         command.add_argument("--tasks", nargs="+", default=[*INSTRUCTIONS])
-        command.add_argument("--seeds", type=int, default=3)
-        command.add_argument("--episodes", type=int, default=25, help="of each rollout")
         command.add_argument("--jobs", type=int, default=len(os.sched_getaffinity(0)))
+    for command in (one, whole, table, sight):
         command.add_argument("--out", type=Path, required=True)
     wanted = parser.parse_args()
     try:
@@ -92,7 +92,7 @@ def _protocol(wanted: Namespace) -> None:
 def _table(wanted: Namespace) -> None:
     from experiments.metaworld.table import write_tables
 
-    print(write_tables(_run(wanted)))
+    print(write_tables(wanted.out.absolute()))
 
 
 def _sight(wanted: Namespace) -> None:
@@ -104,13 +104,16 @@ def _sight(wanted: Namespace) -> None:
 def _run(wanted: Namespace) -> "Run":
     from experiments.metaworld.protocol import VARIANTS, Run
 
-    variants = getattr(wanted, "variants", [*VARIANTS])
-    if unknown := [name for name in variants if name not in VARIANTS]:
+    if unknown := [name for name in wanted.variants if name not in VARIANTS]:
         raise ConfigError(f"expected variants of {', '.join(VARIANTS)}, found {', '.join(unknown)}")
+    chosen = {
+        name: getattr(wanted, name)
+        for name in ("seeds", "episodes", "jobs", "checkpoint")
+        if hasattr(wanted, name)
+    }
     tasks = tuple(dict.fromkeys(map(full_name, wanted.tasks)))
-    checkpoint = getattr(wanted, "checkpoint", None)
-    sizes = wanted.seeds, wanted.episodes, wanted.jobs
-    return Run(wanted.out.absolute(), tuple(variants), tasks, *sizes, checkpoint)
+    out, variants = wanted.out.absolute(), tuple(wanted.variants)
+    return Run(out, variants, tasks, settings=tuple(wanted.set), **chosen)
 
 
 if __name__ == "__main__":

@@ -2,15 +2,16 @@
 
     OUT/demonstrations/TASK     recorded sets; OUT/demonstrations-3-mm/TASK those with noise
     OUT/vlm                     the demo's model of random weights; any other with --checkpoint
+    OUT/tuned                   the same, tuned on the demonstrations of all five tasks
     OUT/stores/VARIANT-TASK.zarr
-    OUT/policies/VARIANT-TASK-SEED/{model, steps/STEP, rollout/STEP}
+    OUT/policies/VARIANT-TASK-SEED/{model, rollout/STEP}
     OUT/parts.csv               how long each part of a run took, and how many it did
 
 What is done already is not done again, so a run that was stopped goes on.
 """
 
 import os
-import shutil
+import re
 import time
 from collections.abc import Generator, Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
@@ -19,8 +20,7 @@ from dataclasses import dataclass
 from itertools import product
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Any, Final
-from unittest.mock import patch
+from typing import Final
 
 import yaml
 from tqdm import tqdm
@@ -29,17 +29,16 @@ from experiments.metaworld.recording import VERSION, Record, record, seeds_of
 from pipeline.base.config import Params, load_params
 from pipeline.base.errors import ConfigError
 from pipeline.extract.run import extract
-from pipeline.policy.checkpoint import find_policy, load_policy
+from pipeline.policy.checkpoint import load_policy
 from pipeline.simulation.meta_world import INSTRUCTIONS
-from pipeline.train.loop import Trainer
 from stages import finetune, rollout, train_head
 
 EPISODES: Final = 31
 """Demonstrations of a task: the split leaves 25 to 29 to train on; the protocol has 25."""
-JOINT: Final = "all"
-"""In place of a task: one policy for all five."""
 PARTS: Final = "parts.csv"
 """Lines of part, seconds of wall clock, and how many episodes, rows or policies it made."""
+JOINT: Final = "all"
+"""In place of a task: one policy for all five, whatever tasks are asked for."""
 _PARAMS: Final = Path(__file__).with_name("params.yaml")
 
 
@@ -50,12 +49,11 @@ class Variant:
     features: tuple[str, ...] = ()
     policy: tuple[str, ...] = ()
     tuned: bool = False
-    """Whether the model is tuned on all tasks first, and then frozen again."""
+    """Whether the model is tuned on all five tasks first, and then frozen again."""
     joint: bool = False
+    """Whether one policy learns all five tasks."""
     noise_mm: float = 0.0
     """Of the demonstrations; see `Record`."""
-    evaluations: int = 1
-    """How often a training is rolled out, at equal distances, the last time at its end."""
 
     @property
     def rows(self) -> tuple[object, ...]:
@@ -71,7 +69,7 @@ _TOKENS: Final = (
 )
 _POOLER: Final = ("train_head.feature_encoder={kind: pooler}",)
 VARIANTS: Final[dict[str, Variant]] = {
-    "protocol": Variant(evaluations=3),
+    "protocol": Variant(policy=("train_head.keep_every=500",)),
     "one policy": Variant(joint=True),
     "mean": Variant(features=("vlm.pooling=[mean]",)),
     "last": Variant(features=("vlm.pooling=[last]",)),
@@ -103,6 +101,8 @@ class Run:
     episodes: int = 25
     jobs: int = 1
     checkpoint: str | None = None
+    settings: tuple[str, ...] = ()
+    """Params that differ from `params.yaml` in all variants."""
 
     def policies(self) -> Iterator["TrainedPolicy"]:
         """The policies of all variants, by seed first: a table of one seed is soon there."""
@@ -126,14 +126,20 @@ class TrainedPolicy:
         return self.run.out / "policies" / f"{_slug(self.variant)}-{self.task}-{self.seed}"
 
     @property
-    def steps(self) -> Path:
-        """Its checkpoints that are rolled out, each in a folder named by its step."""
-        return self.folder / "steps"
+    def model(self) -> Path:
+        """The run of its training."""
+        return self.folder / "model"
+
+    @property
+    def checkpoints(self) -> dict[int, Path]:
+        """Its checkpoints that are rolled out, by step; the training has to be finished."""
+        found = (*self.model.glob("steps/*"), self.model / "best", self.model / "last")
+        return {load_policy(folder).step: folder for folder in found}
 
     @property
     def tasks(self) -> tuple[str, ...]:
         """The tasks that it learns."""
-        return self.run.tasks if self.task == JOINT else (self.task,)
+        return tuple(INSTRUCTIONS) if self.task == JOINT else (self.task,)
 
     @property
     def store(self) -> Path:
@@ -150,11 +156,12 @@ class TrainedPolicy:
         told += [f"vlm.checkpoint={run.checkpoint}"] if run.checkpoint else []
         told += [f"vlm.adapter={run.out / 'tuned' / 'best' / 'adapter'}"] if variant.tuned else []
         told += [
+            *run.settings,
             f"data.root={_demonstrations(run, variant.noise_mm)}",
             f"extract.store={self.store}",
             f"train_head.seed={self.seed}",
             f"train_head.split={{val: 0.1, test: 0.05, seed: {self.seed}}}",
-            f"train_head.output={self.folder / 'model'}",
+            f"train_head.output={self.model}",
             f"train_head.logs={self.folder / 'logs'}",
             f"rollout.environment={[f'metaworld:{task}' for task in self.tasks]}",
             f"rollout.seed={seeds_of('evaluation', self.seed)[0]}",
@@ -163,16 +170,30 @@ class TrainedPolicy:
         told += [*variant.features, *variant.policy, *settings]
         return load_params(run.out / "params.yaml", told)
 
-    def rollouts(self) -> dict[int, Path]:
-        """Where its rollouts are or will be, by step; the training has to be finished."""
-        steps = sorted(int(folder.name) for folder in self.steps.iterdir())
-        return {step: self.folder / "rollout" / str(step) for step in steps}
+    def rollout(self, step: int) -> Path:
+        """Where the rollout of a checkpoint is or will be."""
+        return self.folder / "rollout" / str(step)
+
+    @property
+    def missing(self) -> dict[int, Path]:
+        """The checkpoints whose rollouts are not there."""
+        written = {step: self.rollout(step) / "report.html" for step in self.checkpoints}
+        return {at: folder for at, folder in self.checkpoints.items() if not written[at].exists()}
 
     @property
     def done(self) -> bool:
         """Whether all of its rollouts are there."""
-        finished = (self.folder / "model").exists() and self.steps.exists()
-        return finished and all((f / "report.html").exists() for f in self.rollouts().values())
+        return self.model.exists() and not self.missing
+
+
+def found_policies(out: Path) -> Iterator[TrainedPolicy]:
+    """The policies of the folder, those too that are not finished."""
+    names = {_slug(name): name for name in VARIANTS}
+    form = re.compile(rf"({'|'.join(names)})-({JOINT}|[a-z-]+-v3)-(\d+)")
+    for folder in sorted((out / "policies").glob("*/")):
+        if told := form.fullmatch(folder.name):
+            slug, task, seed = told.groups()
+            yield TrainedPolicy(Run(out, (names[slug],)), names[slug], task, int(seed))
 
 
 def run_protocol(wanted: Run) -> None:
@@ -203,6 +224,7 @@ def prepare(wanted: Run) -> None:
     """
     wanted.out.mkdir(parents=True, exist_ok=True)
     asked = {"checkpoint": wanted.checkpoint, "episodes": wanted.episodes, "recorder": VERSION}
+    asked |= {"set": [*wanted.settings]} if wanted.settings else {}
     text = f"# run with {asked}\n" + _PARAMS.read_text(encoding="utf-8")
     text, file = text.replace("{out}", str(wanted.out)), wanted.out / "params.yaml"
     if file.exists() and file.read_text(encoding="utf-8") != text:
@@ -229,24 +251,21 @@ def _timed(out: Path, part: str) -> Generator[list[int]]:
 
 
 def _record(wanted: Run) -> None:
-    for noise_mm in sorted({VARIANTS[name].noise_mm for name in wanted.variants}):
+    variants = [VARIANTS[name] for name in wanted.variants]
+    five = any(variant.joint or variant.tuned for variant in variants)
+    tasks = [*INSTRUCTIONS] if five else wanted.tasks
+    for noise_mm in sorted({variant.noise_mm for variant in variants}):
         asked = [
-            Record(
-                version=VERSION,
-                task=task,
-                run=0,
-                episodes=EPISODES,
-                image=224,
-                shadows=False,
-                noise_mm=noise_mm,
-            )
-            for task in wanted.tasks
+            Record(version=VERSION, task=task, run=0, episodes=EPISODES, noise_mm=noise_mm)
+            for task in tasks
         ]
         folder = _demonstrations(wanted, noise_mm)
+        missing = [folder / task for task in tasks if not (folder / task).exists()]
         with _timed(wanted.out, "recorded episodes") as made:
-            missing = [one for one in asked if not (folder / one.task).exists()]
-            record(folder, asked, wanted.jobs)
-            made.append(EPISODES * len(missing))
+            try:
+                record(folder, asked, wanted.jobs)
+            finally:
+                made.append(EPISODES * sum(task.exists() for task in missing))
 
 
 def _extract(wanted: Run, policies: Iterable[TrainedPolicy]) -> None:
@@ -257,35 +276,17 @@ def _extract(wanted: Run, policies: Iterable[TrainedPolicy]) -> None:
 
 
 def train_and_roll_out(policy: TrainedPolicy) -> int:
-    """Train a policy, keep its checkpoints, and roll out those and the one that val chose.
+    """Train a policy, and roll out its checkpoints.
 
     Returns 1, one policy made. What the stages print stands in a file beside its folder.
     """
     policy.folder.mkdir(parents=True, exist_ok=True)
     with policy.folder.with_suffix(".log").open("a") as log, redirect_stdout(log):
-        _train(policy)
-        for step, folder in policy.rollouts().items():
-            if not (folder / "report.html").exists():
-                told = f"rollout.checkpoint={policy.steps / str(step)}", f"rollout.output={folder}"
-                rollout.main(policy.params(*told))
+        train_head.main(policy.params())
+        for step, folder in policy.missing.items():
+            told = f"rollout.checkpoint={folder}", f"rollout.output={policy.rollout(step)}"
+            rollout.main(policy.params(*told))
     return 1
-
-
-def _train(policy: TrainedPolicy) -> None:
-    steps, save = policy.steps, Trainer._save
-
-    def kept(trainer: Trainer, folder: Path, *rest: Any) -> None:
-        save(trainer, folder, *rest)
-        if folder.name == "last":
-            shutil.copytree(folder, steps / str(trainer.step), dirs_exist_ok=True)
-
-    every = policy.params().train_head.max_steps // VARIANTS[policy.variant].evaluations
-    with patch.object(Trainer, "_save", kept):
-        train_head.main(policy.params(f"train_head.checkpoint_every={every}"))
-    best = find_policy(policy.folder / "model")
-    chosen = steps / str(load_policy(best).step)
-    if not chosen.exists():
-        shutil.copytree(best, chosen)
 
 
 def _tune(wanted: Run) -> None:

@@ -12,7 +12,7 @@ from concurrent.futures import ProcessPoolExecutor
 from contextlib import closing
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Any, Final, Literal, NamedTuple
+from typing import Any, Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,7 +28,6 @@ from pipeline.simulation.meta_world import (
     STATE,
     VIEW,
     MetaWorldEnvironment,
-    full_name,
     instruction_of,
 )
 
@@ -57,8 +56,9 @@ class Record(Document):
     task: str
     run: int
     episodes: int
-    image: int
-    shadows: bool
+    image: int = 224
+    """Height and width of its frames."""
+    shadows: bool = False
     noise_mm: float = 0.0
     """Spread of what is added to each motion that is carried out, not to the one that is kept, so
     that demonstrations show how to come back (Laskey et al. 2017, "DART")."""
@@ -72,20 +72,13 @@ class Record(Document):
         return self.model_dump(exclude={"seeds", "failed"})
 
 
-class Demonstration(NamedTuple):
-    """A finished episode; `rows` is None where the expert failed."""
-
-    seed: int
-    rows: LeRobotRows | None
-
-
 def seeds_of(purpose: Purpose, run: int) -> range:
     """Seeds of episodes: those of two purposes, or of two runs, have none in common.
 
     Raises `ConfigError` for a run that is not from 0 to 99.
     """
     if not 0 <= run < 100:
-        raise ConfigError(f"--seed: expected a number from 0 to 99, found {run}")
+        raise ConfigError(f"seed: expected a number from 0 to 99, found {run}")
     first = _FIRST[purpose] + run * SEEDS
     return range(first, first + SEEDS)
 
@@ -118,8 +111,8 @@ def _record_set(
 
     seeds: dict[bool, list[int]] = {True: [], False: []}
 
-    def on_a_core(seed: int) -> Demonstration:
-        return pool.submit(demonstrate, wanted, seed).result()
+    def on_a_core(seed: int) -> tuple[int, LeRobotRows | None]:
+        return seed, pool.submit(demonstrate, wanted, seed).result()
 
     def kept() -> Iterator[LeRobotRows]:
         tried = seeds_of("demonstrations", wanted.run)[: _TRIED * wanted.episodes]
@@ -151,8 +144,8 @@ def _record_set(
     replace_folder(out / wanted.task, write, _SET)
 
 
-def demonstrate(wanted: Record, seed: int) -> Demonstration:
-    """One episode of the scripted expert, with a frame of each step."""
+def demonstrate(wanted: Record, seed: int) -> LeRobotRows | None:
+    """One episode of the scripted expert, with a frame of each step; None where it failed."""
     environment = MetaWorldEnvironment(wanted.task, wanted.image, wanted.shadows)
     readings, _ = environment.reset(seed=seed)
     noise = np.random.default_rng(seed)
@@ -171,15 +164,7 @@ def demonstrate(wanted: Record, seed: int) -> Demonstration:
         "timestamp": (np.arange(len(states)) / HZ).astype(np.float32),
     }
     film = {f"observation.images.{VIEW}": np.stack(frames)}
-    return Demonstration(seed, LeRobotRows(columns, film) if environment.success else None)
-
-
-def recorded(out: Path, task: str) -> Record:
-    """The record of a set.
-
-    Raises `ConfigError` where there is none.
-    """
-    return _BORDER.read_json(out / full_name(task) / RECORD, Record)
+    return LeRobotRows(columns, film) if environment.success else None
 
 
 def _finished(out: Path, wanted: Record) -> Record | None:
@@ -190,7 +175,7 @@ def _finished(out: Path, wanted: Record) -> Record | None:
     folder = out / wanted.task
     if not there(folder):
         return None
-    kept = recorded(out, wanted.task)
+    kept = _BORDER.read_json(folder / RECORD, Record)
     if kept.wanted != wanted.wanted:
         differ = [f"{k} {v}" for k, v in kept.wanted.items() if wanted.wanted[k] != v]
         raise ConfigError(

@@ -2,7 +2,8 @@
 
 import csv
 import json
-from collections.abc import Iterator, Sequence
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -11,13 +12,13 @@ from typing import Any, Final
 import numpy as np
 from matplotlib.figure import Figure
 
-from experiments.metaworld.protocol import PARTS, VARIANTS, Run, TrainedPolicy
+from experiments.metaworld.protocol import PARTS, VARIANTS, TrainedPolicy, found_policies
 from pipeline.base.text import Table
 from pipeline.evaluate.rollouts import SuccessRate, error_bars
 from pipeline.look.page.blocks import Picture, Report, Section, Text
 from pipeline.look.page.style import PALETTE, finish, panels
 from pipeline.look.page.writing import write_report
-from pipeline.policy.checkpoint import find_policy, load_policy
+from pipeline.policy.checkpoint import load_policy
 from pipeline.simulation.meta_world import HZ, INSTRUCTIONS
 
 PUBLISHED: Final = {"VC-1 base": "85.3 ± 5.2", "VC-1 large": "88.8 ± 2.2", "Ego4D large": "92.9"}
@@ -53,14 +54,14 @@ class Judged:
         return self.successes[max(self.successes)]
 
 
-def judged(run: Run) -> list[Judged]:
-    """Every policy of the run that is finished, once for each of its tasks."""
-    return [one for policy in run.policies() if policy.done for one in _judged(policy)]
+def judged(out: Path) -> list[Judged]:
+    """Every policy in the folder that is finished, once for each of its tasks."""
+    return [one for policy in found_policies(out) if policy.done for one in _judged(policy)]
 
 
 def _judged(policy: TrainedPolicy) -> Iterator[Judged]:
-    validated = load_policy(find_policy(policy.folder / "model")).step
-    rows = {step: _rows(folder / "episodes.csv") for step, folder in policy.rollouts().items()}
+    validated = load_policy(policy.model / "best").step
+    rows = {step: _rows(policy.rollout(step) / "episodes.csv") for step in policy.checkpoints}
     for task in policy.tasks:
         ended = {
             step: [row["success"] == "True" for row in episodes if row["level"] == task]
@@ -70,11 +71,31 @@ def _judged(policy: TrainedPolicy) -> Iterator[Judged]:
 
 
 def success_table(name: str, policies: Sequence[Judged]) -> Table:
-    """A row for each task, and their mean, of one variant."""
+    """A row for each task, and their mean over the trainings of all of these, of one variant."""
     tasks = _tasks(policies)
     rows = [_row(task, [p for p in policies if p.task == task]) for task in tasks]
     heads = ("task", "best", "last", "validated", "policies", "episodes")
-    return Table(heads, [*rows, _row(f"mean of {len(tasks)}", policies)], name)
+    if whole := _of_all(policies):
+        rows.append(_row(f"mean of {len(tasks)}", whole))
+    return Table(heads, rows, name)
+
+
+def _of_all(policies: Sequence[Judged]) -> list[Judged]:
+    """Those of the trainings that are finished for every task."""
+    tasks = Counter(one.policy.seed for one in policies)
+    return [one for one in policies if tasks[one.policy.seed] == len(_tasks(policies))]
+
+
+def overview(by_variant: Mapping[str, Sequence[Judged]]) -> Table:
+    """The success of the last checkpoint: a row for each variant, a column for each task."""
+    tasks = _tasks([one for own in by_variant.values() for one in own])
+    rows = list[tuple[str, ...]]()
+    for name, own in by_variant.items():
+        ended = [[s for p in own if p.task == task for s in p.last] for task in tasks]
+        shown = [f"{np.mean(one):.0%}" if one else "" for one in ended]
+        whole = [s for p in _of_all(own) for s in p.last] if all(ended) else []
+        rows.append((name, *shown, str(SuccessRate.of(whole)) if whole else ""))
+    return Table(("variant", *tasks, "mean"), rows, "Success of the last checkpoint")
 
 
 def _row(label: str, policies: Sequence[Judged]) -> tuple[Any, ...]:
@@ -103,77 +124,62 @@ def parts_table(out: Path) -> Table:
     return Table(("part", "made", "hours", "seconds each"), rows, "Wall clock of the parts")
 
 
-def write_tables(run: Run) -> Path:
-    """Write page and `tables.json`; returns the page. Only finished policies count."""
-    policies = judged(run)
+def write_tables(out: Path) -> Path:
+    """Write page and `tables.json` of what is finished; returns the page."""
+    policies = judged(out)
     by_variant = {
         name: own
         for name in VARIANTS
         if (own := [one for one in policies if one.policy.variant == name])
     }
-    tables = [success_table(name, own) for name, own in by_variant.items()]
-    beside = Table(("encoder", "best"), list(PUBLISHED.items()), "CortexBench, published")
-    parts = parts_table(run.out)
-    for table in (*tables, parts):
+    tables = {name: success_table(name, own) for name, own in by_variant.items()}
+    parts = parts_table(out)
+    shown = (*tables.values(), overview(by_variant), parts)
+    for table in shown:
         print(table.caption, *table.text(), sep="\n")
-    figures = {name: {row[0]: row[1:] for row in t.rows} for name, t in zip(by_variant, tables)}  # noqa: B905
     content = {
         "published": PUBLISHED,
-        "episodes": run.episodes,
-        "variants": figures,
-        "parts": {row[0]: row[1:] for row in parts.rows},
+        "variants": {name: _content(table) for name, table in tables.items()},
+        "parts": _content(parts),
     }
-    (run.out / "tables.json").write_text(json.dumps(content, indent=1), encoding="utf-8")
-    picture = Picture(
-        "success", "The last checkpoint, with 95 % intervals.", partial(_draw, by_variant)
-    )
-    pictures = [picture]
-    if len([name for name in by_variant if name in REUSE]) > 1:
-        drawn = partial(_draw_reuse, by_variant)
+    (out / "tables.json").write_text(json.dumps(content, indent=1), encoding="utf-8")
+    pictures = list[Picture]()
+    reuse = {REUSE[name]: own for name, own in by_variant.items() if name in REUSE}
+    if len(reuse) > 1 and (shared := _shared_tasks(reuse)):
         told = "Ticks of 12.5 ms that share a pass of the model; last checkpoints, 95 % intervals."
-        pictures.append(Picture("reuse", told, drawn))
+        pictures.append(Picture("reuse", told, partial(_draw_reuse, reuse, shared)))
+    beside = Table(("encoder", "best"), list(PUBLISHED.items()), "CortexBench, published")
     report = Report(
         "Meta-World by CortexBench's protocol",
         "Frozen features of a vision-language model on tasks that this project did not make.",
         [],
         (
-            Section("Success", [Text(_RULES), *pictures, *tables, beside]),
+            Section("Success", [Text(_RULES), overview(by_variant), *pictures, beside]),
+            Section("Each variant", [*tables.values()]),
             Section("What it took", [parts]),
-            Section("Films", [Text(f"Each policy's page is in {run.out / 'policies'}.")]),
+            Section("Films", [*_films(policies)]),
         ),
     )
-    write_report(run.out / "report", report)
-    return run.out / "report" / "report.html"
+    write_report(out / "report", report)
+    return out / "report" / "report.html"
 
 
-def _draw(by_variant: dict[str, list[Judged]]) -> Figure:
-    tasks = _tasks([one for own in by_variant.values() for one in own])
-    figure, axis = panels(9.0, 1.2 + 0.35 * len(by_variant) * (len(tasks) + 1) / 2, 1, 1)
-    labels, named = [*tasks, "mean"], set[str]()
-    for place, (name, own) in enumerate(by_variant.items()):
-        for at, label in enumerate(labels):
-            whole = label == "mean" and _tasks(own) == tasks
-            ended = [s for p in own if whole or p.task == label for s in p.last]
-            if not ended:  # this variant was run on other tasks
-                continue
-            centre, bars = error_bars([SuccessRate.of(ended)])
-            height = at + 0.8 * (place + 0.5) / len(by_variant)
-            style = {
-                "color": PALETTE[place % len(PALETTE)],
-                "label": None if name in named else name,
-            }
-            named.add(name)
-            axis.errorbar(centre, height, xerr=bars, fmt="o", **style)
-    axis.set(xlim=(-2, 102), xlabel="success [%]", yticks=np.arange(len(labels)) + 0.4)
-    axis.set_yticklabels(labels)
-    axis.invert_yaxis()
-    finish(figure, axis, 4, "Success of the last checkpoint")
-    return figure
+def _content(table: Table) -> dict[str, Sequence[Any]]:
+    return {row[0]: row[1:] for row in table.rows}
 
 
-def _draw_reuse(by_variant: dict[str, list[Judged]]) -> Figure:
-    own = {REUSE[name]: policies for name, policies in by_variant.items() if name in REUSE}
-    shared = [task for task in INSTRUCTIONS if all(task in _tasks(p) for p in own.values())]
+def _films(policies: Sequence[Judged]) -> Iterator[Text]:
+    for policy in dict.fromkeys(one.policy for one in policies):
+        page = policy.rollout(max(policy.checkpoints)) / "report.html"
+        told = f"{policy.variant}, {policy.task}, seed {policy.seed}: "
+        yield Text(told, str(Path("..") / page.relative_to(policy.run.out)))
+
+
+def _shared_tasks(reuse: Mapping[int, Sequence[Judged]]) -> list[str]:
+    return [task for task in INSTRUCTIONS if all(task in _tasks(own) for own in reuse.values())]
+
+
+def _draw_reuse(own: Mapping[int, Sequence[Judged]], shared: Sequence[str]) -> Figure:
     counts = sorted(own)
     figure, axis = panels(6.0, 3.4, 1, 1)
     for place, label in enumerate([*shared, f"mean of {len(shared)}"]):

@@ -160,6 +160,10 @@ class Trainer:
                     self._evaluate(log, progress)
                 if self.step % LOG_EVERY == 0 or self._over:
                     self._write_down(log, progress)
+                if self.params.keep_every and self.step % self.params.keep_every == 0:
+                    self._check_finite()
+                    with progress.paused():
+                        self._save(self.run.kept(self.step), self._losses)
                 if self.step % self.params.checkpoint_every == 0 or self._over or stopped:
                     self._save_last(log, progress)
                 if stopped and not self._over:
@@ -309,7 +313,11 @@ class Trainer:
         }
         write_state = partial(write_trainer, state=state, tensors=tensors)
         with progress.paused():
-            self._save(self.run.last, {"train/loss": self.history.last("loss")}, write_state)
+            self._save(self.run.last, self._losses, write_state)
+
+    @property
+    def _losses(self) -> dict[str, float]:
+        return {"train/loss": self.history.last("loss")}
 
     def _save(
         self,

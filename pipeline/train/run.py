@@ -55,7 +55,7 @@ from pipeline.policy.shape import (
 from pipeline.store import FeatureStore, build_lock
 from pipeline.train.training_data import list_differences, source_of
 
-RUN, BEST, LAST = "run.json", "best", "last"
+RUN, BEST, LAST, STEPS = "run.json", "best", "last", "steps"
 TRAINER_WEIGHTS, TRAINER_DOCUMENT = "trainer.safetensors", "trainer.json"
 TRAINER_VERSION = 5
 """Raise it with every change of code that changes the numbers of a run. It is part of the run's
@@ -68,6 +68,7 @@ FREE_PARAMS = {
     "logs",
     "loggers",
     "checkpoint_every",
+    "keep_every",
     "store",
     "grad_accumulation",
 }
@@ -110,6 +111,10 @@ class TrainingRun:
     def last(self) -> Path:
         """The newest checkpoint, with the trainer's state."""
         return self.part / LAST
+
+    def kept(self, step: int) -> Path:
+        """The checkpoint of a step that stays (`keep_every`)."""
+        return self.part / STEPS / str(step)
 
     def begin(self) -> None:
         """Create the part of a new run with its `run.json`; does nothing for a resumed run.

@@ -106,6 +106,20 @@ def test_what_a_finished_run_leaves(undisturbed):
     assert {"error", "translation_mm", "rotation_deg", "gripper"} == set(metrics["val"])
 
 
+def test_checkpoints_are_kept_through_a_kill(store, params, trainer, stop_at):
+    stop_at(trainer(store, params(keep_every=4)), 13)
+    resumed = trainer(store, params(keep_every=4))
+    assert resumed.step == 10
+    resumed.fit()
+    kept = {int(step.name): load_policy(step) for step in (resumed.run.output / "steps").iterdir()}
+    assert {step: policy.step for step, policy in kept.items()} == {
+        at: at for at in range(4, 21, 4)
+    }
+    last = load_policy(resumed.run.output / "last").weights
+    assert all(torch.equal(value, last[name]) for name, value in kept[20].weights.items())
+    assert any(not torch.equal(value, last[name]) for name, value in kept[12].weights.items())
+
+
 def test_without_held_out_episodes_the_best_is_the_newest(store, params, trainer):
     done = trainer(store, params(split={"val": 0, "test": 0}, max_steps=4, eval_every=2))
     done.fit()

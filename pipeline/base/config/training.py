@@ -256,6 +256,9 @@ class TrainHeadParams(Section):
     """Stop after this many evaluations in a row without a better one; null never stops early."""
     checkpoint_every: int = Field(default=200, ge=1, le=10**9)
     """Steps between checkpoints."""
+    keep_every: int | None = Field(default=None, ge=1, le=10**9)
+    """Steps between checkpoints that stay, in `<output>/steps/STEP`, for a choice by rollouts; null
+    keeps the best and the last alone."""
     seed: Seed = 0
     """Seed of weights, order and dropout."""
     device: str = "auto"
