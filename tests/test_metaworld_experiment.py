@@ -118,6 +118,8 @@ def test_a_mean_has_only_trainings_that_are_finished_for_every_task(tmp_path: Pa
 
     both = [one("hammer-v3", 0, [True, True]), one("drawer-open-v3", 0, [False, False])]
     policies = [*both, one("hammer-v3", 1, [True, True])]
+    with pytest.raises(ConfigError, match="no finished policy"):
+        write_tables(tmp_path)
     assert {(p.variant, p.task, p.seed) for p in found_policies(tmp_path)} == {
         ("reuse 3", p.task, p.policy.seed) for p in policies
     }

@@ -13,6 +13,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from experiments.metaworld.protocol import PARTS, VARIANTS, TrainedPolicy, found_policies
+from pipeline.base.errors import ConfigError
 from pipeline.base.text import Table
 from pipeline.evaluate.rollouts import SuccessRate, error_bars
 from pipeline.look.page.blocks import Picture, Report, Section, Text
@@ -125,8 +126,12 @@ def parts_table(out: Path) -> Table:
 
 
 def write_tables(out: Path) -> Path:
-    """Write page and `tables.json` of what is finished; returns the page."""
-    policies = judged(out)
+    """Write page and `tables.json` of what is finished; returns the page.
+
+    Raises `ConfigError` where nothing is.
+    """
+    if not (policies := judged(out)):
+        raise ConfigError(f"{out}: no finished policy. Name the folder of a run with --out")
     by_variant = {
         name: own
         for name in VARIANTS
