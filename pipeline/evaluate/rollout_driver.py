@@ -138,6 +138,9 @@ def _all(
 ) -> Rollouts:
     """The rollouts of all drivers, one after another."""
     wanted, metadata = drivers[0].wanted, drivers[0].metadata
+    for driver in drivers:
+        for line in _renamed(metadata["streams"], driver.widths, driver.robot):
+            say(f"warning: {line}")
     episodes = [episode for driver in drivers for episode in driver.run(ablations, say)]
     settings = wanted.model_dump(mode="json", exclude={"checkpoint", "output", "device"})
     described = ("checkpoint", "step", "weights", "model_type")
@@ -169,6 +172,25 @@ def _refuse_other_robot(
             f"recordings ({command('evaluate')}) and set rollout.environment to null, which leaves "
             "rollouts out of dvc repro."
         )
+
+
+def _renamed(
+    streams: Mapping[str, Any], widths: Mapping[str, int], robot: EnvironmentRobot
+) -> Iterator[str]:
+    """A line for each stream whose channels the policy was trained on by other names or units."""
+    for name, own in robot.streams.items():
+        trained = streams.get(name)
+        if not (widths[name] and own and trained):
+            continue
+        told = [
+            ", ".join(map(" ".join, zip(names, units, strict=True)))
+            for names, units in ((own.names, own.units), (trained["names"], trained["units"]))
+        ]
+        if told[0] != told[1]:
+            yield (
+                f"rollout.environment: {robot.name} has {name} channels {told[0]}; the policy was "
+                f"trained on {told[1]}. They have to be the same quantities in the same order"
+            )
 
 
 def _described(views: Sequence[str], kind: str, widths: Mapping[str, int], hz: float) -> str:

@@ -57,14 +57,16 @@ class TestTheRecipe(EnvironmentContract):
         return environment("slide:Slide")
 
 
-def driven(names: Any, act: Any = None, **source: Any) -> tuple[Rollouts, Glance]:
+def driven(
+    names: Any, act: Any = None, units: str = "mm", say: Any = print, **source: Any
+) -> tuple[Rollouts, Glance]:
     """Rollouts of a policy for a cart, whose chunks `act` gives."""
     checkpoint, _, glance = made(views=1)
     shape = PolicyShape(SLOTS, DIM, 0, 1, 1, ("translation",), views=1)
     normal = replace(no_normalization(shape), sensor=None)
     torch.manual_seed(0)
     policy = Policy(checkpoint.params, shape, normal).eval()
-    action = {"names": ["dx"], "units": ["mm"], "kind": "delta"}
+    action = {"names": ["dx"], "units": [units], "kind": "delta"}
     streams = {"action": action, "views": ["View1"]}
     trained = {
         "feature_spec": {"views": ["View1"]}, "streams": streams, "action_hz": 10.0,
@@ -78,7 +80,7 @@ def driven(names: Any, act: Any = None, **source: Any) -> tuple[Rollouts, Glance
     )
     if act is not None:
         policy.act = act
-    return roll_out(cart, "models/cart", policy, lambda: glance, wanted), glance
+    return roll_out(cart, "models/cart", policy, lambda: glance, wanted, say), glance
 
 
 def towards_the_middle(observation: Any, *_: Any) -> torch.Tensor:
@@ -127,6 +129,15 @@ def test_what_cannot_be_rolled_out_is_refused_by_name() -> None:
         environment("fractions:Fraction")
     with pytest.raises(ValueError, match=r"metaworld:TASK or module:name, found 'phantm'"):
         RolloutParams.model_validate({"environment": "phantm"})
+
+
+def test_channels_of_other_units_are_warned_of() -> None:
+    said: list[str] = []
+    driven("slide:Slide", towards_the_middle, say=said.append)
+    assert not any("warning" in line for line in said)
+    driven("slide:Slide", towards_the_middle, units="m", say=said.append)
+    (line,) = (line for line in said if "warning" in line)
+    assert "slide:Slide has action channels dx mm; the policy was trained on dx m." in line
 
 
 def test_absolute_actions_must_say_what_stands_still() -> None:
