@@ -27,11 +27,13 @@ PUBLISHED: Final = {"VC-1 base": "85.3 ± 5.2", "VC-1 large": "88.8 ± 2.2", "Eg
 REUSE: Final = {"reuse 1": 1, "reuse 3": 3, "protocol": 10, "reuse 30": 30}
 """Variants that differ in `vlm_reuse_count` alone."""
 _RULES: Final = (
-    "best: of each training the best of its evaluations, as CortexBench counts, which flatters. "
-    "last: the checkpoint at the end. validated: the one that the held-out demonstrations chose. "
-    "These have Wilson's 95 % interval over all episodes of all seeds. v3 tasks and the camera "
-    "corner2, where CortexBench has v2 and a camera that the package lacks; frames have the marks "
-    "of the goal that Meta-World draws."
+    "best: of each training the best of its evaluations, as CortexBench counts, which flatters; it "
+    "has 20 of them, a training here three or four. Its spread is the standard deviation of the "
+    "trainings. last: the checkpoint at the end. validated: the one that the held-out "
+    "demonstrations chose. These have Wilson's 95 % interval over all episodes of all trainings. "
+    "Not as CortexBench: v3 tasks (v2 there); the camera corner2, for the package lacks theirs; "
+    "frames with the marks of the goal that Meta-World draws; the size of frames, the reuse of "
+    "features, chunks and steps of training, as params.yaml says."
 )
 
 
