@@ -94,7 +94,11 @@ def test_the_protocol_goes_from_demonstrations_to_a_table(tmp_path, monkeypatch,
     run_here(run, monkeypatch)
     assert before == {p: p.stat().st_mtime_ns for p in policy.folder.rglob("*") if p.is_file()}
     with pytest.raises(ConfigError, match="found those of another run"):
-        run_here(replace(run, episodes=2), monkeypatch)
+        run_here(replace(run, settings=("train_head.lr=0.1",)), monkeypatch)
+    with pytest.raises(ConfigError, match=r"vlm\.dtyp"):
+        run_here(replace(run, out=tmp_path / "new", settings=("vlm.dtyp=x",)), monkeypatch)
+    assert not (tmp_path / "new").exists()
+    assert not replace(policy, run=replace(run, episodes=2)).done, "more are to be rolled out"
     (one,) = judged(run.out)
     assert one.task == tasks[0] and {len(ended) for ended in one.successes.values()} == {1}
     capsys.readouterr()

@@ -14,7 +14,7 @@ import os
 import sys
 from argparse import ArgumentParser, Namespace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 from experiments.metaworld.recording import VERSION, Record, record
 from pipeline.base.errors import ConfigError, PipelineError
@@ -22,6 +22,9 @@ from pipeline.simulation.meta_world import INSTRUCTIONS, full_name
 
 if TYPE_CHECKING:
     from experiments.metaworld.protocol import Run
+
+
+_SET: Final = "a param of all policies; what a variant or the run itself sets wins"
 
 
 def main() -> int:
@@ -49,7 +52,7 @@ def main() -> int:
         command.add_argument(
             "--checkpoint", help="a Qwen2.5-VL; the demo's random weights otherwise"
         )
-        command.add_argument("--set", action="append", default=[], metavar="KEY=VALUE")
+        command.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help=_SET)
     for command in (one, whole, sight):
         command.add_argument("--tasks", nargs="+", default=[*INSTRUCTIONS])
         command.add_argument("--jobs", type=int, default=len(os.sched_getaffinity(0)))

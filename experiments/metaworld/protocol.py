@@ -27,9 +27,10 @@ from tqdm import tqdm
 
 from experiments.metaworld.recording import VERSION, Record, record, seeds_of
 from pipeline.base.config import Params, load_params
-from pipeline.base.errors import ConfigError
+from pipeline.base.errors import CheckpointIncomplete, ConfigError
+from pipeline.base.files import read_document
 from pipeline.extract.run import extract
-from pipeline.policy.checkpoint import load_policy
+from pipeline.policy.checkpoint import DOCUMENT, PolicyDocument
 from pipeline.simulation.meta_world import INSTRUCTIONS
 from stages import finetune, rollout, train_head
 
@@ -102,7 +103,7 @@ class Run:
     jobs: int = 1
     checkpoint: str | None = None
     settings: tuple[str, ...] = ()
-    """Params that differ from `params.yaml` in all variants."""
+    """Params that differ from `params.yaml`; what a variant or the run itself sets wins."""
 
     def policies(self) -> Iterator["TrainedPolicy"]:
         """The policies of all variants, by seed first: a table of one seed is soon there."""
@@ -132,9 +133,12 @@ class TrainedPolicy:
 
     @property
     def checkpoints(self) -> dict[int, Path]:
-        """Its checkpoints that are rolled out, by step; the training has to be finished."""
+        """Its checkpoints that are rolled out, by step; the training has to be finished.
+
+        Raises `CheckpointIncomplete` where the document of one is damaged.
+        """
         found = (*self.model.glob("steps/*"), self.model / "best", self.model / "last")
-        return {load_policy(folder).step: folder for folder in found}
+        return {read_document(one / DOCUMENT, PolicyDocument)[0].step: one for one in found}
 
     @property
     def tasks(self) -> tuple[str, ...]:
@@ -176,14 +180,23 @@ class TrainedPolicy:
 
     @property
     def missing(self) -> dict[int, Path]:
-        """The checkpoints whose rollouts are not there."""
-        written = {step: self.rollout(step) / "report.html" for step in self.checkpoints}
-        return {at: folder for at, folder in self.checkpoints.items() if not written[at].exists()}
+        """The checkpoints without a rollout of as many episodes as the run asks for."""
+        wanted = self.run.episodes * len(self.tasks)
+        return {at: folder for at, folder in self.checkpoints.items() if self._played(at) < wanted}
+
+    def _played(self, step: int) -> int:
+        folder = self.rollout(step)
+        if not (folder / "report.html").exists():  # written last
+            return 0
+        return len((folder / "episodes.csv").read_text(encoding="utf-8").splitlines()) - 1
 
     @property
     def done(self) -> bool:
-        """Whether all of its rollouts are there."""
-        return self.model.exists() and not self.missing
+        """Whether it is trained, and all of its rollouts are there."""
+        try:
+            return self.model.exists() and not self.missing
+        except CheckpointIncomplete:
+            return False
 
 
 def found_policies(out: Path) -> Iterator[TrainedPolicy]:
@@ -193,7 +206,8 @@ def found_policies(out: Path) -> Iterator[TrainedPolicy]:
     for folder in sorted((out / "policies").glob("*/")):
         if told := form.fullmatch(folder.name):
             slug, task, seed = told.groups()
-            yield TrainedPolicy(Run(out, (names[slug],)), names[slug], task, int(seed))
+            any_number = Run(out, (names[slug],), episodes=1)
+            yield TrainedPolicy(any_number, names[slug], task, int(seed))
 
 
 def run_protocol(wanted: Run) -> None:
@@ -205,25 +219,27 @@ def run_protocol(wanted: Run) -> None:
         _tune(wanted)
     _extract(wanted, {policy.store: policy for policy in missing}.values())
     os.environ.setdefault("OMP_NUM_THREADS", str(max(1, (os.cpu_count() or 1) // wanted.jobs)))
-    pool = ProcessPoolExecutor(wanted.jobs, get_context("spawn"), max_tasks_per_child=1)
-    try:
-        with _timed(wanted.out, "policies") as made:
+    with _timed(wanted.out, "policies") as made:
+        pool = ProcessPoolExecutor(wanted.jobs, get_context("spawn"), max_tasks_per_child=1)
+        try:
             begun = [pool.submit(train_and_roll_out, policy) for policy in missing]
             ends = tqdm(as_completed(begun), "policies", len(begun), unit="policy", disable=None)
             for ended in ends:
-                made.append(ended.result())
-    finally:  # what is under way may end, nothing more begins
-        pool.shutdown(cancel_futures=True)
+                ended.result()
+        finally:  # what is under way may end, nothing more begins
+            pool.shutdown(cancel_futures=True)
+            made.append(sum(policy.done for policy in missing))
 
 
 def prepare(wanted: Run) -> None:
     """Write the params that all policies in the folder share, and the demo's model.
 
-    Raises `ConfigError` where the folder was begun with others, whose policies would be mixed up
-    with those of now.
+    Raises `ConfigError` for a wrong setting, and where the folder was begun with others, whose
+    policies would be mixed up with those of now.
     """
+    load_params(_PARAMS, wanted.settings)
     wanted.out.mkdir(parents=True, exist_ok=True)
-    asked = {"checkpoint": wanted.checkpoint, "episodes": wanted.episodes, "recorder": VERSION}
+    asked = {"checkpoint": wanted.checkpoint, "recorder": VERSION}
     asked |= {"set": [*wanted.settings]} if wanted.settings else {}
     text = f"# run with {asked}\n" + _PARAMS.read_text(encoding="utf-8")
     text, file = text.replace("{out}", str(wanted.out)), wanted.out / "params.yaml"
@@ -275,10 +291,10 @@ def _extract(wanted: Run, policies: Iterable[TrainedPolicy]) -> None:
                 made.append(report.computed)
 
 
-def train_and_roll_out(policy: TrainedPolicy) -> int:
+def train_and_roll_out(policy: TrainedPolicy) -> None:
     """Train a policy, and roll out its checkpoints.
 
-    Returns 1, one policy made. What the stages print stands in a file beside its folder.
+    What the stages print stands in a file beside its folder.
     """
     policy.folder.mkdir(parents=True, exist_ok=True)
     with policy.folder.with_suffix(".log").open("a") as log, redirect_stdout(log):
@@ -286,7 +302,6 @@ def train_and_roll_out(policy: TrainedPolicy) -> int:
         for step, folder in policy.missing.items():
             told = f"rollout.checkpoint={folder}", f"rollout.output={policy.rollout(step)}"
             rollout.main(policy.params(*told))
-    return 1
 
 
 def _tune(wanted: Run) -> None:

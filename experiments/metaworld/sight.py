@@ -40,8 +40,7 @@ def write_sight(run: Run, fitted: Sequence[int] = FITTED, held: int = _HELD) -> 
     """
     if any(VARIANTS[name].tuned for name in run.variants) and not (run.out / "tuned").exists():
         raise ConfigError(f"{run.out / 'tuned'}: no tuned model; run the variant tuned first")
-    if not (run.out / "params.yaml").exists():  # what a run of policies there says stands
-        prepare(run)
+    prepare(run)
     seeds = seeds_of("validation", 0)[: max(fitted) + held]
     rows: list[tuple[str | float, ...]] = []
     told = slice(max(fitted), None)

@@ -27,6 +27,7 @@ from pipeline.base.config import (
 )
 from pipeline.base.errors import CheckpointMismatch, ConfigError
 from pipeline.base.printed_commands import command
+from pipeline.evaluate.figures import with_unit
 from pipeline.evaluate.rollouts import (
     EXPERT,
     POLICY,
@@ -182,11 +183,13 @@ def _renamed(
         trained = streams.get(name)
         if not (widths[name] and own and trained):
             continue
-        told = [
-            ", ".join(map(" ".join, zip(names, units, strict=True)))
-            for names, units in ((own.names, own.units), (trained["names"], trained["units"]))
-        ]
-        if told[0] != told[1]:
+        units = zip(own.units, trained["units"], strict=False)
+        known = [(mine, other) for mine, other in units if mine and other]
+        if [*own.names] != [*trained["names"]] or any(mine != other for mine, other in known):
+            told = [
+                ", ".join(map(with_unit, names, units))
+                for names, units in ((own.names, own.units), (trained["names"], trained["units"]))
+            ]
             yield (
                 f"rollout.environment: {robot.name} has {name} channels {told[0]}; the policy was "
                 f"trained on {told[1]}. They have to be the same quantities in the same order"

@@ -51,8 +51,8 @@ class Proof(Document):
         worst = min(self.losses, key=lambda loss: loss.r2)
         ends = "" if worst.low is None else f" ({worst.low:+.4f} to {worst.high:+.4f})"
         return (
-            f"a probe of {self.recordings} recordings of {self.store} found that R2 alone changes "
-            f"by {worst.r2:+.4f}{ends} from float32, at worst ({worst.of})"
+            f"a probe of {self.recordings} recordings of {self.store} found that the R2 of the "
+            f"features alone changes by {worst.r2:+.4f}{ends} from float32, at worst ({worst.of})"
         )
 
 

@@ -175,7 +175,7 @@ def head_params(params: Params) -> TrainHeadParams:
             f"train_head.feature_history {params.train_head.feature_history}: the model is tuned "
             "on one row a tick. Set it to 1 for stages.finetune."
         )
-    kept = {"lr": params.train_head.lr}  # `finetune.lr` is the model's
+    kept = {"lr": params.train_head.lr, "keep_every": None}  # `finetune.lr` is the model's
     shared = TrainHeadParams.model_fields.keys() & FinetuneParams.model_fields.keys()
     changes = {name: getattr(params.finetune, name) for name in shared} | kept
     return params.train_head.model_copy(update=changes)

@@ -187,6 +187,8 @@ def open_run(
     if (part / RUN).exists():
         recover_folder(part / BEST, CHECKPOINT)
         recover_folder(part / LAST, CHECKPOINT)
+        for half in (part / STEPS).glob("*.new"):
+            recover_folder(half.with_suffix(""), CHECKPOINT)
     if (part / RUN).exists() and _has_checkpoint(part):
         if differing := _compare(part, identity, section):
             notes.append(

@@ -50,8 +50,8 @@ def test_a_verdict_is_found_by_the_features_and_their_type(tmp_path: Path) -> No
     for other in (slots("last"), slots("grid", cells=4), slots("mean", "last")):
         assert find_proof(tmp_path, INT8 | {"slots": other}) is None
     assert str(PROOF) == (
-        "a probe of 24 recordings of whole.zarr found that R2 alone changes by -0.0040 (-0.0090 to "
-        "+0.0000) from float32, at worst (layer 3, grid)"
+        "a probe of 24 recordings of whole.zarr found that the R2 of the features alone changes by "
+        "-0.0040 (-0.0090 to +0.0000) from float32, at worst (layer 3, grid)"
     )
     assert proof_of({"proof": PROOF.model_dump(mode="json")}) == PROOF
     assert proof_of({}) is proof_of({"proof": {"recordings": "many"}}) is None

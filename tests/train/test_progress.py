@@ -103,7 +103,7 @@ def test_a_lossy_store_is_named_with_the_proof(store, described, monkeypatch):
     plain, spec = store.attrs, store.spec
     for dtype, more, said in (
         ("int8", {}, "stages.probe with probe.codecs on a store in float32"),
-        ("float16", {"proof": proof}, "a probe of 24 recordings of whole.zarr found that R2 alone"),
+        ("float16", {"proof": proof}, "a probe of 24 recordings of whole.zarr found that the R2 "),
     ):
         lossy = {"feature_spec": spec | {"storage_dtype": dtype}}
         monkeypatch.setattr(store, "attrs", {**plain, **lossy, **more})

@@ -258,7 +258,7 @@ class TrainHeadParams(Section):
     """Steps between checkpoints."""
     keep_every: int | None = Field(default=None, ge=1, le=10**9)
     """Steps between checkpoints that stay, in `<output>/steps/STEP`, for a choice by rollouts; null
-    keeps the best and the last alone."""
+    keeps the best and the last alone. It does nothing to a finished run, and not in fine-tuning."""
     seed: Seed = 0
     """Seed of weights, order and dropout."""
     device: str = "auto"
