@@ -237,7 +237,7 @@ def prepare(wanted: Run) -> None:
     Raises `ConfigError` for a wrong setting, and where the folder was begun with others, whose
     policies would be mixed up with those of now.
     """
-    load_params(_PARAMS, wanted.settings)
+    load_params(_PARAMS, ["data.sources=[{name: task, path: task}]", *wanted.settings])
     wanted.out.mkdir(parents=True, exist_ok=True)
     asked = {"checkpoint": wanted.checkpoint, "recorder": VERSION}
     asked |= {"set": [*wanted.settings]} if wanted.settings else {}
