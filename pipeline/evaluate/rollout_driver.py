@@ -27,7 +27,6 @@ from pipeline.base.config import (
 )
 from pipeline.base.errors import CheckpointMismatch, ConfigError
 from pipeline.base.printed_commands import command
-from pipeline.evaluate.figures import with_unit
 from pipeline.evaluate.rollouts import (
     EXPERT,
     POLICY,
@@ -187,7 +186,7 @@ def _renamed(
         known = [(mine, other) for mine, other in units if mine and other]
         if [*own.names] != [*trained["names"]] or any(mine != other for mine, other in known):
             told = [
-                ", ".join(map(with_unit, names, units))
+                ", ".join(f"{one} {unit}".strip() for one, unit in zip(names, units, strict=False))
                 for names, units in ((own.names, own.units), (trained["names"], trained["units"]))
             ]
             yield (

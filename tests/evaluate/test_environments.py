@@ -137,7 +137,7 @@ def test_channels_of_other_units_are_warned_of() -> None:
     assert not any("warning" in line for line in said)
     driven("slide:Slide", towards_the_middle, units="m", say=said.append)
     (line,) = (line for line in said if "warning" in line)
-    assert "slide:Slide has action channels dx [mm]; the policy was trained on dx [m]." in line
+    assert "slide:Slide has action channels dx mm; the policy was trained on dx m." in line
     driven("slide:Slide", towards_the_middle, units="", say=said.append)
     assert sum("warning" in line for line in said) == 1, "a recording may name no unit"
 
