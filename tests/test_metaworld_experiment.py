@@ -71,7 +71,6 @@ def test_a_set_is_what_the_expert_did_and_is_recorded_once(tmp_path: Path) -> No
 @pytest.mark.extra
 def test_the_protocol_goes_from_demonstrations_to_a_table(tmp_path, monkeypatch, capsys):
     """Tiny: three demonstrations of one task, six steps, rollouts of one episode."""
-
     monkeypatch.setattr(protocol, "EPISODES", 3)
     blind = VARIANTS["features off"]
     blind = replace(blind, policy=(*blind.policy, "train_head.keep_every=2"))
@@ -114,7 +113,6 @@ def test_the_protocol_goes_from_demonstrations_to_a_table(tmp_path, monkeypatch,
 
 
 def test_a_mean_has_only_trainings_that_are_finished_for_every_task(tmp_path: Path) -> None:
-
     def one(task: str, seed: int, success: list[bool]) -> Judged:
         policy = TrainedPolicy(Run(tmp_path, ("reuse 3",)), "reuse 3", task, seed)
         policy.folder.mkdir(parents=True)
@@ -164,7 +162,6 @@ def test_a_regression_finds_places_in_rows_that_it_did_not_see() -> None:
 @pytest.mark.usefixtures("meta_world")
 @pytest.mark.extra
 def test_sight_has_a_row_for_each_variant_beside_the_mean(tmp_path: Path) -> None:
-
     run = Run(tmp_path / "out", ("mean",), ("button-press-topdown-v3",))
     table = write_sight(run, fitted=(4, 8), held=4)
     blind, seen = table.rows

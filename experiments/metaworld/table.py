@@ -141,8 +141,8 @@ def write_tables(out: Path) -> Path:
     }
     tables = {name: success_table(name, own) for name, own in by_variant.items()}
     parts = parts_table(out)
-    shown = (*tables.values(), overview(by_variant), parts)
-    for table in shown:
+    whole = overview(by_variant)
+    for table in (*tables.values(), whole, parts):
         print(table.caption, *table.text(), sep="\n")
     content = {
         "published": PUBLISHED,
@@ -161,7 +161,7 @@ def write_tables(out: Path) -> Path:
         "Frozen features of a vision-language model on tasks that this project did not make.",
         [],
         (
-            Section("Success", [Text(_RULES), overview(by_variant), *pictures, beside]),
+            Section("Success", [Text(_RULES), whole, *pictures, beside]),
             Section("Each variant", [*tables.values()]),
             Section("What it took", [parts]),
             Section("Films", [*_films(policies)]),
