@@ -55,8 +55,8 @@ def row_race(
     )
 
 
-def code_race(store: FeatureStore, sizes: Mapping[str, Any], rounds: int) -> Race:
-    """Random VL rows of a store of codes, against C gathers of the same bytes from RAM."""
+def kept_race(store: FeatureStore, sizes: Mapping[str, Any], rounds: int) -> Race:
+    """Random VL rows of a store, against C gathers of the same bytes from RAM."""
     count, mapped = sizes["rows"], store.gatherer.tensor("features")
     drawn = draws(sizes["draws"], count, 0, len(mapped))
     ram, out = mapped.clone(), torch.zeros((count, *mapped.shape[1:]), dtype=mapped.dtype)

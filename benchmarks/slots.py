@@ -3,10 +3,12 @@
     python -m benchmarks.slots [--rows N] [--quick]
 
 Every contender fills a store of its own with the same recordings, the model loaded beforehand; all
-frames differ. Beside them, what it costs to make numbers of int8 and float8 again, against the copy
-of as many numbers in float32. Prints one JSON line.
+frames differ. Beside them, how fast tokens, whose rows are wide, are written without a model: that
+bounds extraction where the model is faster. And what it costs to make numbers of int8 and float8
+again, against the copy of as many numbers in float32. Prints one JSON line.
 """
 
+import shutil
 import tempfile
 from contextlib import ExitStack, closing
 from pathlib import Path
@@ -15,6 +17,7 @@ from typing import Any
 import torch
 
 from benchmarks.stage_one import StageOne
+from benchmarks.stores import write_store
 from benchmarks.timing import arguments, at_least, race, report
 from benchmarks.workload import Workload, params_of, write_recordings
 from pipeline.base.digests import ContentDigests
@@ -35,6 +38,8 @@ CONTENDERS: dict[str, tuple[dict[str, Any], str]] = {
     "tokens of the vision tower": (TOKENS | {"layers": ["vision"]}, "float32"),
 }
 _DIM, _SLOTS = 2048, 48
+_VIEW = (13, 69)
+"""Rows and columns of 897 tokens, those of three views of 364 x 644 pixels."""
 
 
 def main() -> None:
@@ -57,6 +62,7 @@ def main() -> None:
         )
         ratios = raced.ratios("mean")
         row_bytes = {name: run.row_bytes for name, run in runs.items()}
+        writing = _race_writing(folder, 4 if wanted.quick else 300, rounds)
     numbers = torch.randn(64, slots, _DIM)
     copied = torch.empty_like(numbers)
     held = {dtype: pack(numbers, dtype) for dtype in ("int8", "float8")}
@@ -72,6 +78,7 @@ def main() -> None:
         results={
             "extraction": raced.results({"rows": rows}),
             "row_bytes": row_bytes,
+            "writing": writing,
             "decoding": decoding.results({"GB_of_float32": numbers.nbytes / 1e9}),
         },
         ratios={"extraction": ratios, "decoding": decoding.ratios("copy in float32")},
@@ -94,6 +101,21 @@ def _stage_one(folder: Path, name: str, rows: int, stack: ExitStack) -> StageOne
     digests = stack.enter_context(closing(ContentDigests(folder / "digests.sqlite")))
     work = Workload.of(params, rows, digests)
     return StageOne(work, FrozenVLM.load(params.vlm, work.survey.spec, "cpu"), 8)
+
+
+def _race_writing(folder: Path, rows: int, rounds: int) -> dict[str, dict[str, float]]:
+    """A whole store of tokens of random content, from its folder to its seal."""
+    place, few = folder / "written.zarr", {"readings": 9, "states": 9, "channels": 9}
+
+    def write() -> None:
+        write_store(place, episodes=1, ticks=rows, reuse=1, tokens=_VIEW, dim=_DIM, **few)
+
+    def remove() -> None:
+        shutil.rmtree(place, ignore_errors=True)
+
+    found = race({"tokens, float16": write}, rounds, 0, before={"tokens, float16": remove})
+    row_bytes = _VIEW[0] * _VIEW[1] * _DIM * 2
+    return found.results({"rows": rows, "GB": rows * row_bytes / 1e9})
 
 
 if __name__ == "__main__":

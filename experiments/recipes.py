@@ -75,12 +75,12 @@ SLOTS: dict[str, tuple[str, ...]] = {
     "tokens of two layers": ("vlm.pooling=[tokens]", _TWO_LAYERS),
     "int8": ("extract.dtype=int8",),
     "float8": ("extract.dtype=float8",),
-    "pca 32 in int8": ("extract.dtype={{pca: 32, then: int8}}",),
+    **{f"pca {k} in int8": (f"extract.dtype={{{{pca: {k}, then: int8}}}}",) for k in (32, 64)},
     "tokens in int8": ("vlm.pooling=[tokens]", "extract.dtype=int8"),
     "tokens of the vision tower": ("vlm.pooling=[tokens]", "vlm.layers=[vision]"),
 }
 """What a store keeps of the demo's recordings, beside the demo's own mean and grid."""
-EIGHT_BITS = ("int8", "float8", "pca 32 in int8")
+EIGHT_BITS = ("int8", "float8", "pca 32 in int8", "pca 64 in int8")
 
 
 def _store_of(name: str) -> Store:

@@ -74,10 +74,12 @@ VARIANTS: Final[dict[str, Variant]] = {
     "one policy": Variant(joint=True),
     "mean": Variant(features=("vlm.pooling=[mean]",)),
     "last": Variant(features=("vlm.pooling=[last]",)),
+    "grid 2x2": Variant(features=("vlm.pooling=[{grid: [2, 2]}]",)),
     "224 pixels": Variant(
         features=("vlm.image_resize_height=224", "vlm.image_resize_width=224", "vlm.grid=[8, 8]")
     ),
     "tokens": Variant(features=_TOKENS, policy=_POOLER),
+    "two layers": Variant(features=(*_TOKENS, "vlm.layers=[1, -1]"), policy=_POOLER),
     "vision": Variant(features=(*_TOKENS, "vlm.layers=[vision]"), policy=_POOLER),
     "features off": Variant(policy=("train_head.features_enabled=false",)),
     "state off": Variant(policy=("train_head.robot_state_enabled=false",)),
