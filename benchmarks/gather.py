@@ -69,19 +69,20 @@ QUICK = FULL | {
     "least_s": 0.001,
     "long_store": 20_000,
 }
-KEPT: dict[str, dict[str, Any]] = {
-    "mean": {"slots": 1},
-    "grid 2x2": {"slots": 12},
-    "mean, grid": {"slots": 49},
-    "mean, grid in int8": {"slots": 49, "dtype": "int8"},
-    "mean, grid in pca 32, int8": {"slots": 49, "dim": 32, "dtype": "int8"},
-    "tokens": {"slots": 72},
-    "tokens in int8": {"slots": 72, "dtype": "int8"},
-    "tokens of two layers": {"slots": 144},
-    "grid 8x8": {"slots": 192},
+KEPT: dict[str, tuple[int, int, str]] = {
+    "mean": (1, 128, "float32"),
+    "grid 2x2": (12, 128, "float32"),
+    "mean, grid": (49, 128, "float32"),
+    "mean, grid in int8": (49, 128, "int8"),
+    "mean, grid in pca 32, int8": (49, 32, "int8"),
+    "tokens": (72, 128, "float32"),
+    "tokens in int8": (72, 128, "int8"),
+    "tokens of two layers": (144, 128, "float32"),
+    "grid 8x8": (192, 128, "float32"),
 }
-"""Slots of the demo's three views; a slot has 128 numbers in float32 where it says no other."""
+"""Slots of the demo's three views, the numbers of one, and their dtype."""
 _KEPT_BYTES = 320_000_000
+_NARROW: dict[str, Any] = {"episodes": 40, "readings": 200, "states": 200, "channels": 16, "reuse": 1}
 
 
 def main() -> None:
@@ -184,12 +185,16 @@ def slots(
     ratios: dict[str, Any] = {}
     targets: list[dict[str, Any]] = []
     for name in [*KEPT][3:4] if options.quick else KEPT:
-        narrow: dict[str, Any] = {"readings": 200, "states": 200, "channels": 16, "reuse": 1}
-        kept = {"dim": 128, "dtype": "float32"} | KEPT[name]
-        itemsize = 1 if kept["dtype"] == "int8" else 4
-        rows = min(150_000, _KEPT_BYTES // (kept["slots"] * kept["dim"] * itemsize))
-        length = {"episodes": 2, "ticks": 300} if options.quick else {"episodes": 40}
-        path = write_store(folder / "kept.zarr", **narrow, **kept, **{"ticks": rows // 40} | length)
+        count, dim, dtype = KEPT[name]
+        rows = min(150_000, _KEPT_BYTES // (count * dim * (1 if dtype == "int8" else 4)))
+        path = write_store(
+            folder / "kept.zarr",
+            **_NARROW,
+            slots=count,
+            dim=dim,
+            dtype=dtype,
+            ticks=300 if options.quick else rows // _NARROW["episodes"],
+        )
         store = FeatureStore.open(path)
         found = kept_race(store, sizes, options.rounds or (2 if options.quick else 15))
         ceiling, part = min(CEILINGS, key=found.median), f"rows of {name}"

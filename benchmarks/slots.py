@@ -105,10 +105,11 @@ def _stage_one(folder: Path, name: str, rows: int, stack: ExitStack) -> StageOne
 
 def _race_writing(folder: Path, rows: int, rounds: int) -> dict[str, dict[str, float]]:
     """A whole store of tokens of random content, from its folder to its seal."""
-    place, few = folder / "written.zarr", {"readings": 9, "states": 9, "channels": 9}
+    place = folder / "written.zarr"
+    few = {"episodes": 1, "reuse": 1, "readings": 9, "states": 9, "channels": 9, "dim": _DIM}
 
     def write() -> None:
-        write_store(place, episodes=1, ticks=rows, reuse=1, tokens=_VIEW, dim=_DIM, **few)
+        write_store(place, **few, ticks=rows, tokens=_VIEW, dtype="float16")
 
     def remove() -> None:
         shutil.rmtree(place, ignore_errors=True)
