@@ -82,7 +82,7 @@ KEPT: dict[str, tuple[int, int, str]] = {
 }
 """Slots of the demo's three views, the numbers of one, and their dtype."""
 _KEPT_BYTES = 320_000_000
-_NARROW: dict[str, Any] = {"episodes": 40, "readings": 200, "states": 200, "channels": 16, "reuse": 1}
+_NARROW: dict[str, Any] = {"episodes": 40, "readings": 200, "states": 200, "channels": 16}
 
 
 def main() -> None:
@@ -190,6 +190,7 @@ def slots(
         path = write_store(
             folder / "kept.zarr",
             **_NARROW,
+            reuse=1,
             slots=count,
             dim=dim,
             dtype=dtype,
