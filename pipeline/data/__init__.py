@@ -21,7 +21,6 @@ from pipeline.data.recording import (
     Stream,
     absolute,
     content_digest,
-    entries,
     natural_key,
 )
 
@@ -36,7 +35,6 @@ __all__ = [
     "RecordingError",
     "Stream",
     "content_digest",
-    "open_recording",
     "open_recordings",
 ]
 
@@ -96,25 +94,6 @@ def open_recordings(
     if views is not None:
         _check_views(recordings, views)
     return Opened(tuple(recordings), tuple(missing), tuple(bad))
-
-
-def open_recording(
-    path: Path, format: str, id: str, views: Sequence[str] | None = None
-) -> Recording:
-    """The one episode that a store lists with this path, format and id; keeps the views in `views`.
-
-    Raises `RecordingError` where it is missing or no longer of that format.
-    """
-    reader, source = READERS[format], Source(name=format, path=str(path))
-    if not reader.marks(path, [entry.name for entry in entries(path)]):
-        raise RecordingError(f"{path}: not of the format {format} (no {reader.marker})")
-    episodes, _ = reader.open(path, source, views)
-    # An id that occurs more than once in its source has parent folders before it.
-    name = id.rpartition("/")[2]
-    for episode in episodes:
-        if format != "lerobot" or episode.id == name:
-            return episode
-    raise RecordingError(f"{path}: has no episode {id}")
 
 
 def _name_apart(recordings: Sequence[Recording]) -> None:

@@ -3,8 +3,7 @@
 If the error stays the same, the policy does not use the stream, or other streams tell it the same.
 """
 
-from collections.abc import Callable, Generator, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,8 +16,8 @@ from pipeline.evaluate.figures import Figure, times
 from pipeline.policy.checkpoint import PolicyCheckpoint
 from pipeline.policy.policy import Policy
 from pipeline.store import Batch, FeatureStore
-from pipeline.train.batches import NO_LAGS, BatchIndices, Lags, Prefetch, Ticks, Windows, evenly
-from pipeline.train.predictions import FeedMaker, predict
+from pipeline.train.batches import NO_LAGS, Lags, Ticks, Windows, evenly
+from pipeline.train.predictions import predict
 from pipeline.train.scores import Comparison, action_space, compare
 from pipeline.train.training_data import groups_of
 
@@ -87,8 +86,7 @@ def evaluate_ablation(
         "out, so near their episode's start that a delay would reach beyond it"
     ] * (left_out > 0)
     ticks = evenly(settled, MOST_TICKS)
-    windows, device = Windows.of(checkpoint.params), next(policy.parameters()).device
-    ways: list[tuple[str, str, Ticks, FeedMaker | None]] = [("", "intact", ticks, None)]
+    ways: list[tuple[str, str, Ticks, Lags, Alter | None]] = [("", "intact", ticks, NO_LAGS, None)]
     for stream in (stream for stream in STREAMS if stream in policy.encoders):
         having = ticks[_having(store, ticks, stream)]
         if len(having) < len(ticks):
@@ -98,18 +96,20 @@ def evaluate_ablation(
         if not len(having):
             continue
         if len(having) < len(ticks):
-            ways.append((stream, "intact", having, None))
+            ways.append((stream, "intact", having, NO_LAGS, None))
         alter = zeroed(stream, checkpoint.typical(stream))
-        ways.append((stream, "zeroed", having, feed_maker(store, windows, device, alter=alter)))
-        for how, lags in delays(store, stream).items():
-            ways.append((stream, how, having, feed_maker(store, windows, device, lags)))
+        ways.append((stream, "zeroed", having, NO_LAGS, alter))
+        ways += [(stream, how, having, lags, None) for how, lags in delays(store, stream).items()]
         if stream == "features":
             notes.append(f"features delayed: by whole VL rows, of {_row_ms(store):.0f} ms each")
     space = action_space(store, checkpoint.normalization)
     intact: dict[str, Comparison] = {}
     ablated: list[Ablated] = []
-    for stream, how, here, feed in tqdm(ways, "ablating streams", unit="way", disable=None):
-        predictions = predict(policy, store, here, windows, batch_size, False, samples, feed)
+    windows = Windows.of(checkpoint.params)
+    for stream, how, here, lags, alter in tqdm(ways, "ablating streams", unit="way", disable=None):
+        predictions = predict(
+            policy, store, here, windows, batch_size, samples=samples, lags=lags, alter=alter
+        )
         groups = groups_of(store, checkpoint, here)
         comparison = compare(predictions, baselines.act(here), space, groups)
         if how == "intact":
@@ -117,26 +117,6 @@ def evaluate_ablation(
         else:
             ablated.append(Ablated(stream, how, comparison, intact.get(stream, intact[""])))
     return AblationStudy(intact[""], tuple(ablated), tuple(notes), samples)
-
-
-def feed_maker(
-    store: FeatureStore,
-    windows: Windows,
-    device: torch.device,
-    lags: Lags = NO_LAGS,
-    alter: Alter | None = None,
-) -> FeedMaker:
-    """Feeds of this store in which streams come late or are altered."""
-
-    @contextmanager
-    def make(plan: Sequence[BatchIndices]) -> Generator[Iterator[tuple[BatchIndices, Batch]]]:
-        late = [replace(indices, lags=lags) for indices in plan]
-        with Prefetch(store, late, windows, device) as batches:
-            yield (
-                (indices, batch if alter is None else alter(batch)) for indices, batch in batches
-            )
-
-    return make
 
 
 def zeroed(stream: str, mean: NDArray[np.floating]) -> Alter:

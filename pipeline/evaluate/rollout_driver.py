@@ -37,13 +37,12 @@ from pipeline.evaluate.rollouts import (
     late_name,
 )
 from pipeline.policy.checkpoint import PolicyCheckpoint
-from pipeline.policy.observation import moving_channels
 from pipeline.policy.policy import Policy
 from pipeline.robot.client import PolicyClient
 from pipeline.robot.live_features import LiveFeatures, prove
 from pipeline.robot.loop import ControlLoop, Executor, SafeStop, check_chunking
 from pipeline.robot.readings import RobotMemory, SeenFeatures
-from pipeline.robot.session import stack_guides
+from pipeline.robot.session import policy_metadata, stack_guides
 from pipeline.simulation.environment import InsertionEnvironment, environment_maker
 from pipeline.simulation.interface import Action, EnvironmentRobot, RobotEnvironment, Shots
 
@@ -71,18 +70,7 @@ def roll_out(
     `ConfigError` for an unknown environment, for an instruction that the policy was not trained on,
     for chunking that its expert cannot do and for more steps than a chunk has.
     """
-    shape, source = checkpoint.shape, checkpoint.source
-    metadata = {key: source[key] for key in ("streams", "action_hz", "vlm_reuse_count")} | {
-        "checkpoint": name,
-        "step": checkpoint.step,
-        "weights": checkpoint.digest,
-        "model_type": policy.params.model_type,
-        "instructions": checkpoint.instructions,
-        "horizon": policy.params.horizon,
-        "moving": moving_channels(source["streams"]["action"]),
-        "stochastic": policy.stochastic,
-        "uses_features": "features" in policy.encoders,
-    }
+    shape, metadata = checkpoint.shape, policy_metadata(checkpoint, policy, name)
     widths = {"action": shape.action_dim, "state": shape.state_dim, "sensor": shape.sensor_channels}
     drivers = [
         _LocalDriver(metadata, widths, wanted, make, checkpoint, policy)

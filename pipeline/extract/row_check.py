@@ -130,7 +130,7 @@ def reextract(path: Path, params: Params, say: Callable[[str], None]) -> Reextra
             deviations += map(partial(_compare, store), batch, features)
             bar.update(len(batch))
     return Reextraction(
-        tuple(sorted(deviations, key=lambda row: -np.nan_to_num(row.relative, nan=np.inf))),
+        tuple(sorted(deviations, key=lambda row: -row.relative)),
         tolerance,
         unchecked,
         tuple(sorted({line for lines in differing for line in lines})),
@@ -141,6 +141,6 @@ def _compare(store: FeatureStore, row: ReadyRow, features: NDArray[Any]) -> Devi
     """Compare the stored row with new features (variant x slot, dim), both in storage dtype."""
     stored = store.array(FEATURES)[row.row]
     deviations = slot_deviations(widen(stored), widen(features), code_size(stored))
-    slot = deviations.worst
+    slot = int(deviations.argmax())
     same_pixels = store.array("vl/key")[row.row].tobytes() == row.key
-    return Deviation(row.row, float(deviations.relative[slot]), slot, same_pixels, row.where)
+    return Deviation(row.row, float(deviations[slot]), slot, same_pixels, row.where)

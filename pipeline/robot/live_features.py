@@ -90,14 +90,15 @@ def prove(checkpoint: PolicyCheckpoint, features: LiveFeatures, say: Callable[[s
             array_of(pack(numbers.float(), spec["storage_dtype"]))
             for numbers in (torch.from_numpy(row.features), live[0])
         )
-        deviation = slot_deviations(widen(held), widen(today), code_size(held))
-        relative = deviation.relative
-        largest = max(largest, (float(relative.max()), deviation.worst))
+        deviations = slot_deviations(widen(held), widen(today), code_size(held))
+        worst_first = np.argsort(-deviations, kind="stable").tolist()
+        largest = max(largest, (float(deviations.max()), worst_first[0]))
         other = np.flatnonzero(valid[0].numpy() != row.slot_valid).tolist()
-        if wrong := list(dict.fromkeys([*other, *deviation.beyond(tolerance)])):
+        beyond = [slot for slot in worst_first if deviations[slot] > tolerance]
+        if wrong := list(dict.fromkeys([*other, *beyond])):
             shown = [
                 f"{slot_name(slots[slot])} "
-                + ("is missing in one of both" if slot in other else f"{relative[slot]:.1e}")
+                + ("is missing in one of both" if slot in other else f"{deviations[slot]:.1e}")
                 for slot in wrong
             ]
             refused.append(f"  {row.instruction!r}: {', '.join(capped(shown, 'slots', _SHOWN))}")

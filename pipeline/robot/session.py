@@ -35,6 +35,37 @@ Pass = tuple[SeenFeatures, float]
 """The features of one pass of the model, and the seconds that the pass took."""
 
 
+def policy_metadata(checkpoint: PolicyCheckpoint, policy: Policy, name: str) -> dict[str, Any]:
+    """What a robot or a simulation has to know of a policy; `name` is where it was found."""
+    source, params = checkpoint.source, policy.params
+    action = source["streams"]["action"]
+    period_s = source["vlm_reuse_count"] / (source["action_hz"] or np.inf)
+    return {
+        "protocol": PROTOCOL,
+        "feature_spec": source["feature_spec"],
+        "feature_spec_digest": source["feature_spec"].get("digest", ""),
+        "streams": source["streams"],
+        "action_hz": source["action_hz"],
+        "vlm_reuse_count": source["vlm_reuse_count"],
+        "horizon": params.horizon,
+        "action_dim": policy.shape.action_dim,
+        "anchored": policy.shape.anchored(action["names"]),
+        "relative": policy.shape.relative_to_state(action["names"]),
+        "moving": list(moving_channels(action)),
+        "model_type": params.model_type,
+        "stochastic": policy.stochastic,
+        "uses_features": "features" in policy.encoders,
+        "looks_at": list(policy.encoders),
+        "instructions": list(checkpoint.instructions),
+        "sensor_window": params.sensor_window,
+        "state_window": params.state_readings,
+        "trained_age_s": params.trained_age_s(period_s),
+        "checkpoint": name,
+        "step": checkpoint.step,
+        "weights": checkpoint.digest,
+    }
+
+
 class ServedPolicy:
     """A policy and its live model, shared by sessions.
 
@@ -51,10 +82,10 @@ class ServedPolicy:
     ) -> None:
         """`features` is the proved model, None where the policy looks at no features."""
         self.checkpoint, self.policy, self.look = checkpoint, policy, look
-        self._features, self._name = features, name
+        self._features = features
         self._passes = ThreadPoolExecutor(1, "vlm")
         self._head = threading.Lock()
-        self.metadata = self._metadata()
+        self.metadata = policy_metadata(checkpoint, policy, name)
 
     @classmethod
     def load(
@@ -123,35 +154,6 @@ class ServedPolicy:
         key = self._features.key(observation.frames, instruction)
         seen = SeenFeatures(features[0].numpy(), valid[0].numpy(), observation.frame_time_s, key)
         return seen, perf_counter() - began
-
-    def _metadata(self) -> dict[str, Any]:
-        source, params = self.checkpoint.source, self.policy.params
-        return {
-            "protocol": PROTOCOL,
-            "feature_spec": source["feature_spec"],
-            "feature_spec_digest": source["feature_spec"].get("digest", ""),
-            "streams": source["streams"],
-            "action_hz": source["action_hz"],
-            "vlm_reuse_count": source["vlm_reuse_count"],
-            "horizon": params.horizon,
-            "action_dim": self.policy.shape.action_dim,
-            "anchored": self.policy.shape.anchored(source["streams"]["action"]["names"]),
-            "relative": self.policy.shape.relative_to_state(source["streams"]["action"]["names"]),
-            "moving": list(moving_channels(source["streams"]["action"])),
-            "model_type": params.model_type,
-            "stochastic": self.policy.stochastic,
-            "uses_features": self._features is not None,
-            "looks_at": list(self.policy.encoders),
-            "instructions": list(self.checkpoint.instructions),
-            "sensor_window": params.sensor_window,
-            "state_window": params.state_readings,
-            "trained_age_s": params.trained_age_s(
-                source["vlm_reuse_count"] / (source["action_hz"] or np.inf)
-            ),
-            "checkpoint": self._name,
-            "step": self.checkpoint.step,
-            "weights": self.checkpoint.digest,
-        }
 
 
 class Session:

@@ -353,11 +353,8 @@ def check_agreement(
     streams, spec = attrs.streams, attrs.feature_spec
     pairs = {
         "streams.action.names": (streams.action.names, specs["tick/action"].shape[1]),
-        "streams.action.units": (streams.action.units, specs["tick/action"].shape[1]),
         "streams.sensor.names": (streams.sensor.names, specs["sensor/values"].shape[1]),
-        "streams.sensor.units": (streams.sensor.units, specs["sensor/values"].shape[1]),
         "streams.state.names": (streams.state.names, specs["state/values"].shape[1]),
-        "streams.state.units": (streams.state.units, specs["state/values"].shape[1]),
         "streams.views": (streams.views, specs["vl/frame_time"].shape[1]),
         "feature_spec.slots": (spec.slots, specs[FEATURES].shape[1]),
     }

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -11,11 +11,18 @@ from numpy.typing import NDArray
 from torch import Generator
 from tqdm import tqdm
 
-from pipeline.base.arrays import first_non_finite
-from pipeline.base.errors import NumericsError
 from pipeline.policy.policy import Trainable
-from pipeline.store import Batch, FeatureStore, place
-from pipeline.train.batches import BatchIndices, Prefetch, Ticks, Windows, cut_batches
+from pipeline.store import Batch, FeatureStore
+from pipeline.train.batches import (
+    NO_LAGS,
+    BatchIndices,
+    Lags,
+    Prefetch,
+    Ticks,
+    Windows,
+    cut_batches,
+)
+from pipeline.train.statistics import check_finite
 
 Actions = NDArray[np.float32]
 FeedMaker = Callable[
@@ -65,6 +72,8 @@ def predict(
     samples: int = 1,
     feed: FeedMaker | None = None,
     watch: Watch | None = None,
+    lags: Lags = NO_LAGS,
+    alter: Callable[[Batch], Batch] | None = None,
 ) -> Predictions:
     """The policy's chunks at these ticks, in evaluation mode, beside the recorded chunks.
 
@@ -72,14 +81,15 @@ def predict(
     `samples` independent samples, never the error of their mean. One generator of fixed seed draws
     the noise of all batches: the same weights, ticks, `samples` and `batch_size` give the same
     figures; another `batch_size` changes those of a stochastic policy. Runs on the policy's device,
-    on the batches of `feed`, by default the store's. `watch` is called with all samples. `progress`
-    shows a bar on a terminal. Raises `NumericsError`, naming episode, tick and time, where a
+    on the batches of `feed`, by default the store's. Streams are `lags` late, and the policy sees
+    what `alter` makes of a batch. `watch` is called with all samples. `progress` shows a bar on a
+    terminal. Raises `NumericsError`, naming episode, tick and time, where a
     prediction or a recorded action is NaN or infinite.
     """
     device = next(policy.parameters()).device
     # On the CPU, so that every device gets the same noise.
     generator = Generator().manual_seed(_SEED)
-    plan = cut_batches(ticks, batch_size)
+    plan = [replace(indices, lags=lags) for indices in cut_batches(ticks, batch_size)]
     predicted, recorded, valid, sampled = [], [], [], []
     with (
         torch.inference_mode(),
@@ -90,13 +100,23 @@ def predict(
     ):
         for indices, batch in batches:
             at = indices.ticks
-            chunks = _sample(policy, batch, samples, generator)
+            chunks = _sample(policy, alter(batch) if alter else batch, samples, generator)
             predicted.append(chunks[0])
             recorded.append(batch.action.cpu().numpy().copy())
             valid.append(batch.action_valid.cpu().numpy().astype(bool))
-            _check_finite(store, at, recorded[-1], "recorded action", valid[-1])
+            own = at[:, None] + np.arange(recorded[-1].shape[1])
+            steps, flat = own.ravel(), (own.size, recorded[-1].shape[2])
+            check_finite(
+                store,
+                "tick",
+                steps,
+                "recorded action",
+                recorded[-1].reshape(flat),
+                valid[-1].ravel(),
+            )
+            made_at = np.repeat(at, own.shape[1])
             for chunk in chunks:
-                _check_finite(store, at, chunk, "action of the policy")
+                check_finite(store, "tick", made_at, "action of the policy", chunk.reshape(flat))
             if len(chunks) > 1:
                 sampled.append(np.abs(chunks - recorded[-1]).mean(axis=0))
             if watch is not None:
@@ -123,23 +143,3 @@ def _sample(
         for done in range(0, samples, at_once)
     ]
     return np.concatenate(parts)
-
-
-def _check_finite(
-    store: FeatureStore,
-    ticks: Ticks,
-    actions: Actions,
-    what: str,
-    valid: NDArray[np.bool_] | None = None,
-) -> None:
-    bad = first_non_finite(actions, valid)
-    if bad is not None:
-        row, ahead, dimension = bad
-        # A recorded action has a tick of its own; a prediction has the tick it was made at.
-        tick = int(ticks[row]) + (0 if valid is None else ahead)
-        name = store.streams["action"]["names"][dimension]
-        raise NumericsError(
-            f"{place(store, 'tick', tick)} of {store.path}: expected finite numbers, found "
-            f"{actions[bad]} as the {what} ({name}). Look at what was recorded "
-            "there, mend or leave out the recording and run stages.extract again."
-        )

@@ -56,12 +56,7 @@ class Split:
     """What a reader of the metrics must know about this split, or None."""
 
 
-def split_by_episode(
-    store: FeatureStore,
-    params: SplitParams,
-    horizon: int = 8,
-    keys: NDArray[np.uint8] | None = None,
-) -> Split:
+def split_by_episode(store: FeatureStore, params: SplitParams, horizon: int = 8) -> Split:
     """The split of the store's episodes into whole groups, drawn as the module's docstring says.
 
     An added episode moves only its own group, unless a side was empty before or would be after.
@@ -73,11 +68,10 @@ def split_by_episode(
     Of two groups one is test, and the tail of the other is val. A single group is cut by time into
     all three sides. Ticks whose chunk of `horizon` actions reaches into the next side are left out.
 
-    `keys` (vl_row, 16) replace the VL keys of a store that has none. Raises `StoreMismatch` where
-    the store has no tick, and `ConfigError` where no training tick is left or there are fewer
-    groups than folds.
+    Raises `StoreMismatch` where the store has no tick, and `ConfigError` where no training tick is
+    left or there are fewer groups than folds.
     """
-    groups = episodes_by_group(store, params.groups, keys)
+    groups = episodes_by_group(store, params.groups)
     if not groups:
         raise StoreMismatch(
             f"{store.path}: expected ticks to train on, found none. Look at data.sources and run "
@@ -118,9 +112,7 @@ def split_by_episode(
 
 
 def episodes_by_group(
-    store: FeatureStore,
-    patterns: Mapping[str, Sequence[str]] | None = None,
-    keys: NDArray[np.uint8] | None = None,
+    store: FeatureStore, patterns: Mapping[str, Sequence[str]] | None = None
 ) -> dict[str, list[Episode]]:
     """The episodes that have ticks, by group; a group is named by the first "source/id" in it.
 
@@ -128,16 +120,14 @@ def episodes_by_group(
     their recordings name the same group, if `patterns` (shell wildcards for "source/id", by group
     name) of one group match both, or if both share a group with a third episode. Actions are equal
     if the episodes have the same number of ticks and agree within 0.1 % of their range, so a
-    re-encoded copy is recognised. Actions that never change are not compared. `keys` (vl_row, 16)
-    replace the store's own.
+    re-encoded copy is recognised. Actions that never change are not compared.
 
     Raises `ConfigError` if a pattern matches no episode.
     """
     from scipy.cluster.hierarchy import DisjointSet  # slow to import, not needed when finished
 
     episodes = [episode for episode in store.episodes if len(episode.ticks)]
-    keys = store.array("vl/key") if keys is None else keys
-    frame_time = store.array("vl/frame_time")
+    keys, frame_time = store.array("vl/key"), store.array("vl/frame_time")
     together, first = DisjointSet(range(len(episodes))), dict[Hashable, int]()
     for index, episode in enumerate(episodes):
         row = episode.vl_rows.start

@@ -138,34 +138,16 @@ def tolerance_of(spec: Mapping[str, Any]) -> float:
     return max(TOLERANCES[spec[dtype]] for dtype in ("compute_dtype", "storage_dtype"))
 
 
-@dataclass(frozen=True)
-class SlotDeviations:
-    """The largest deviation of each slot of a row, (slot,): absolute, and relative.
-
-    `relative` is to the stored number, or to the root mean square of the slot without its largest
-    tenth where that is more: a few channels hundreds of times larger than the others, as large
-    models have, neither hide a fault in these nor are one by their own rounding. Infinite or NaN
-    where features are not finite.
-    """
-
-    absolute: NDArray[np.float64]
-    relative: NDArray[np.float64]
-
-    @property
-    def worst(self) -> int:
-        """The slot that deviates most."""
-        return int(np.argmax(np.nan_to_num(self.relative, nan=np.inf)))
-
-    def beyond(self, tolerance: float) -> list[int]:
-        """The slots that deviate more, the worst first; includes every NaN."""
-        order = np.argsort(-np.nan_to_num(self.relative, nan=np.inf), kind="stable")
-        return [int(slot) for slot in order if not self.relative[slot] <= tolerance]
-
-
 def slot_deviations(
     stored: NDArray[Any], today: NDArray[Any], code: NDArray[Any] | float = 0.0
-) -> SlotDeviations:
-    """The deviations of a row's features (slot, dim) beyond one `code` of their storage dtype."""
+) -> NDArray[np.float64]:
+    """The largest deviation in each slot of a row (slot, dim) beyond one `code` of its dtype.
+
+    It is relative to the stored number, or to the root mean square of the slot without its largest
+    tenth where that is more: a few channels hundreds of times larger than the others, as large
+    models have, neither hide a fault in these nor are one by their own rounding. Infinite where
+    features are not finite.
+    """
     numbers = stored.astype(np.float64)
     apart = np.maximum(np.abs(today.astype(np.float64) - numbers) - code, 0.0)
     most = np.abs(numbers)
@@ -173,4 +155,4 @@ def slot_deviations(
     size = np.maximum(most, np.sqrt(np.mean(usual**2, axis=-1, keepdims=True)))
     with np.errstate(divide="ignore", invalid="ignore"):
         relative = np.where(apart == 0, 0.0, apart / size)  # a slot of zeros has no deviation
-    return SlotDeviations(apart.max(axis=-1), relative.max(axis=-1))
+    return np.nan_to_num(relative.max(axis=-1), nan=np.inf)

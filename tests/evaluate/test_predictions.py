@@ -8,10 +8,9 @@ import torch
 from scipy.special import erf
 
 from pipeline.base.errors import NumericsError
-from pipeline.evaluate.ablation import feed_maker
 from pipeline.store import FeatureStore
 from pipeline.train import predictions
-from pipeline.train.batches import NO_LAGS, Lags, Windows
+from pipeline.train.batches import Lags, Windows
 from pipeline.train.predictions import Predictions, predict
 
 WINDOWS = Windows(horizon=4, sensor_window=2, state_window=2)
@@ -73,10 +72,9 @@ def test_no_more_chunks_at_once_than_memory_is_promised(store, monkeypatch):
     assert policy.asked == [2, 2, 1] * 2 + [3, 2]
 
 
-def test_the_policy_sees_what_the_feed_hands_out(store: FeatureStore) -> None:
-    device = torch.device("cpu")
+def test_the_policy_sees_late_and_altered_batches(store: FeatureStore) -> None:
     seen = run(StandIn(), store, 1).predicted[:, 0, 0]
-    late = run(StandIn(), store, 1, feed=feed_maker(store, WINDOWS, device, Lags(0, 0.1)))
+    late = run(StandIn(), store, 1, lags=Lags(0, 0.1))
     expected = store.gather(TICKS, sensor_window=2, sensor_lag_s=0.1).sensor[:, -1, 0]
     assert np.array_equal(late.predicted[:, 0, 0], expected.numpy())
     assert not np.array_equal(late.predicted[:, 0, 0], seen)
@@ -87,7 +85,7 @@ def test_the_policy_sees_what_the_feed_hands_out(store: FeatureStore) -> None:
         calls.append(len(batch))
         return replace(batch, sensor=-batch.sensor)
 
-    altered = run(StandIn(), store, 1, feed=feed_maker(store, WINDOWS, device, NO_LAGS, negated))
+    altered = run(StandIn(), store, 1, alter=negated)
     assert np.array_equal(altered.predicted[:, 0, 0], -seen)
     assert calls == [8, 8, 5]
     assert np.array_equal(altered.recorded, late.recorded)
