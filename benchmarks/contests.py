@@ -55,7 +55,7 @@ def row_race(
     )
 
 
-def kept_race(store: FeatureStore, sizes: Mapping[str, Any], rounds: int) -> Race:
+def slot_race(store: FeatureStore, sizes: Mapping[str, Any], rounds: int) -> Race:
     """Random VL rows of a store, against C gathers of the same bytes from RAM."""
     count, mapped = sizes["rows"], store.gatherer.tensor("features")
     drawn = draws(sizes["draws"], count, 0, len(mapped))

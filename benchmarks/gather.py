@@ -6,6 +6,8 @@ that every contender shares. The ceiling is a row gather in C from a copy of the
 faster of `numpy.take(mode="clip")` and `torch.index_select`, both into a reused buffer; of a whole
 batch, those of its four wide fields one after the other, from indices that are there already.
 
+Last come rows by what they keep (`SLOTS`), each in a store of its own (`--slots`: nothing else).
+
 Before each of its turns a fast contender makes all its draws once, off the clock. A kernel that
 looks for idle pages (reclaim, DAMON) marks those of files as unused, but not those of RAM without
 swap; the processor sets each mark again at the next touch, which is not the gather's own time.
@@ -31,8 +33,8 @@ from benchmarks.contests import (
     OURS_2,
     batch_race,
     draws,
-    kept_race,
     row_race,
+    slot_race,
     window_race,
 )
 from benchmarks.loading import stream_rates
@@ -69,7 +71,7 @@ QUICK = FULL | {
     "least_s": 0.001,
     "long_store": 20_000,
 }
-KEPT: dict[str, tuple[int, int, str]] = {
+SLOTS: dict[str, tuple[int, int, str]] = {
     "mean": (1, 128, "float32"),
     "grid 2x2": (12, 128, "float32"),
     "mean, grid": (49, 128, "float32"),
@@ -81,8 +83,10 @@ KEPT: dict[str, tuple[int, int, str]] = {
     "grid 8x8": (192, 128, "float32"),
 }
 """Slots of the demo's three views, the numbers of one, and their dtype."""
-_KEPT_BYTES = 320_000_000
-_NARROW: dict[str, Any] = {"episodes": 40, "readings": 200, "states": 200, "channels": 16}
+_FEATURE_BYTES = 320_000_000
+"""Of each store's codes: more than a cache holds."""
+_NARROW: dict[str, Any] = {"readings": 200, "states": 200, "channels": 16}
+_EPISODES = 40
 
 
 def main() -> None:
@@ -100,7 +104,9 @@ def main() -> None:
         shutil.rmtree(folder)
     report(
         "gather",
-        settings=sizes | {"baseline": "the faster ceiling", "cold": COLD},
+        settings=({"rows": sizes["rows"]} if options.slots else sizes)
+        | {"slots": SLOTS, "feature_bytes": _FEATURE_BYTES}
+        | {"baseline": "the faster ceiling", "cold": COLD},
         results=results,
         ratios=ratios,
         targets=targets,
@@ -184,24 +190,25 @@ def slots(
     results: dict[str, Any] = {}
     ratios: dict[str, Any] = {}
     targets: list[dict[str, Any]] = []
-    for name in [*KEPT][3:4] if options.quick else KEPT:
-        count, dim, dtype = KEPT[name]
-        rows = min(150_000, _KEPT_BYTES // (count * dim * (1 if dtype == "int8" else 4)))
+    for name in ["mean, grid in int8"] if options.quick else SLOTS:
+        count, dim, dtype = SLOTS[name]
+        rows = _FEATURE_BYTES // (count * dim * (1 if dtype == "int8" else 4))
         path = write_store(
-            folder / "kept.zarr",
+            folder / "slots.zarr",
             **_NARROW,
+            episodes=_EPISODES,
             reuse=1,
             slots=count,
             dim=dim,
             dtype=dtype,
-            ticks=300 if options.quick else rows // _NARROW["episodes"],
+            ticks=300 if options.quick else rows // _EPISODES,
         )
         store = FeatureStore.open(path)
-        found = kept_race(store, sizes, options.rounds or (2 if options.quick else 15))
+        found = slot_race(store, sizes, options.rounds or (2 if options.quick else 15))
         ceiling, part = min(CEILINGS, key=found.median), f"rows of {name}"
         row_bytes = store.array("vl/features")[:1].nbytes
         amount = {"rows": sizes["rows"], "GB": sizes["rows"] * row_bytes / 1e9}
-        results[part] = found.results(amount) | {"row_bytes": row_bytes}
+        results[part] = found.results(amount)
         ratios[part] = {"baseline": ceiling, **found.ratios(ceiling)}
         targets.append(against_ceiling(part, found, ceiling, 0.9))
         del store
@@ -284,15 +291,9 @@ def cold(path: Path, rows: Path, sizes: Mapping[str, Any], rounds: int) -> dict[
 
 def open_race(path: Path, folder: Path, long_store: int, rounds: int, least_s: float) -> Race:
     """Opening: a short store, a long one of the same kind, and the large one of this benchmark."""
-    narrow: dict[str, Any] = {
-        "readings": 200,
-        "states": 200,
-        "dim": 64,
-        "channels": 16,
-        "ticks": 200,
-    }
-    short = write_store(folder / "short.zarr", episodes=50, **narrow)
-    long = write_store(folder / "long.zarr", episodes=long_store // 200, **narrow)
+    short = write_store(folder / "short.zarr", episodes=50, ticks=200, dim=64, **_NARROW)
+    episodes = long_store // 200
+    long = write_store(folder / "long.zarr", episodes=episodes, ticks=200, dim=64, **_NARROW)
 
     def first_batch(store: Path) -> Work:
         return lambda: FeatureStore.open(store).gather(np.arange(64))

@@ -3,9 +3,9 @@
     python -m benchmarks.slots [--rows N] [--quick]
 
 Every contender fills a store of its own with the same recordings, the model loaded beforehand; all
-frames differ. Beside them, how fast tokens, whose rows are wide, are written without a model: that
-bounds extraction where the model is faster. And what it costs to make numbers of int8 and float8
-again, against the copy of as many numbers in float32. Prints one JSON line.
+frames differ. Then a whole store of tokens of random content is made and sealed, whose rows are
+wide: its speed bounds extraction where the model is faster. Then numbers of int8 and float8 are
+made again, against the copy of as many numbers in float32. Prints one JSON line.
 """
 
 import shutil
@@ -38,7 +38,7 @@ CONTENDERS: dict[str, tuple[dict[str, Any], str]] = {
     "tokens of the vision tower": (TOKENS | {"layers": ["vision"]}, "float32"),
 }
 _DIM, _SLOTS = 2048, 48
-_VIEW = (13, 69)
+_CELLS = (13, 69)
 """Rows and columns of 897 tokens, those of three views of 364 x 644 pixels."""
 
 
@@ -62,7 +62,8 @@ def main() -> None:
         )
         ratios = raced.ratios("mean")
         row_bytes = {name: run.row_bytes for name, run in runs.items()}
-        writing = _race_writing(folder, 4 if wanted.quick else 300, rounds)
+        written = [4 if wanted.quick else 300, _CELLS[0] * _CELLS[1], _DIM]
+        writing = _race_writing(folder, written[0], rounds)
     numbers = torch.randn(64, slots, _DIM)
     copied = torch.empty_like(numbers)
     held = {dtype: pack(numbers, dtype) for dtype in ("int8", "float8")}
@@ -74,7 +75,7 @@ def main() -> None:
     )
     report(
         "slots",
-        settings={"rows": rows, "rounds": rounds, "decoded": [64, slots, _DIM]},
+        settings={"rows": rows, "rounds": rounds, "decoded": [64, slots, _DIM], "written": written},
         results={
             "extraction": raced.results({"rows": rows}),
             "row_bytes": row_bytes,
@@ -109,13 +110,13 @@ def _race_writing(folder: Path, rows: int, rounds: int) -> dict[str, dict[str, f
     few = {"episodes": 1, "reuse": 1, "readings": 9, "states": 9, "channels": 9, "dim": _DIM}
 
     def write() -> None:
-        write_store(place, **few, ticks=rows, tokens=_VIEW, dtype="float16")
+        write_store(place, **few, ticks=rows, tokens=_CELLS, dtype="float16")
 
     def remove() -> None:
         shutil.rmtree(place, ignore_errors=True)
 
     found = race({"tokens, float16": write}, rounds, 0, before={"tokens, float16": remove})
-    row_bytes = _VIEW[0] * _VIEW[1] * _DIM * 2
+    row_bytes = _CELLS[0] * _CELLS[1] * _DIM * 2
     return found.results({"rows": rows, "GB": rows * row_bytes / 1e9})
 
 

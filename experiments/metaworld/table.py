@@ -188,7 +188,7 @@ def _shared_tasks(reuse: Mapping[int, Sequence[Judged]]) -> list[str]:
 
 def _draw_reuse(own: Mapping[int, Sequence[Judged]], shared: Sequence[str]) -> Figure:
     counts = sorted(own)
-    figure, axis = panels(6.0, 3.4, 1, 1)
+    figure, axis = panels(6.0, 3.8, 1, 1)
     for place, label in enumerate([*shared, f"mean of {len(shared)}"]):
         tasks = [label] if label in shared else shared
         centre, bars = error_bars(
@@ -201,7 +201,7 @@ def _draw_reuse(own: Mapping[int, Sequence[Judged]], shared: Sequence[str]) -> F
     axis.set(xscale="log", ylim=(0, 104), xlabel="control ticks a pass", ylabel="success [%]")
     axis.set_xticks(counts, [f"{n}\n{HZ / n:.3g} a second" for n in counts], minor=False)
     axis.minorticks_off()
-    finish(figure, axis, 1, "Success against vlm_reuse_count")
+    finish(figure, axis, 3, "Success against vlm_reuse_count")
     return figure
 
 

@@ -3,7 +3,6 @@
 If the error stays the same, the policy does not use the stream, or other streams tell it the same.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,7 +16,7 @@ from pipeline.policy.checkpoint import PolicyCheckpoint
 from pipeline.policy.policy import Policy
 from pipeline.store import Batch, FeatureStore
 from pipeline.train.batches import NO_LAGS, Lags, Ticks, Windows, evenly
-from pipeline.train.predictions import predict
+from pipeline.train.predictions import Alter, predict
 from pipeline.train.scores import Comparison, action_space, compare
 from pipeline.train.training_data import groups_of
 
@@ -27,9 +26,6 @@ MOST_TICKS = 1000
 MOST_SAMPLES = 4
 """The most chunks a tick of a stochastic policy, for the same reason; their errors are averaged."""
 STREAMS = ("sensor", "state", "features")
-
-Alter = Callable[[Batch], Batch]
-"""Returns the batch that the policy sees; does not change its argument."""
 
 
 @dataclass(frozen=True)

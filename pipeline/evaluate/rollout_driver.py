@@ -183,9 +183,10 @@ def _renamed(
             )
 
 
-def _described(views: Sequence[str], kind: str, widths: Mapping[str, int], hz: float) -> str:
+def _described(views: Sequence[str], kind: str, widths: Mapping[str, int], hz: float | None) -> str:
     channels = ", ".join(f"{name} channels {width}" for name, width in widths.items())
-    return f"views {', '.join(views)}, action {kind}, {channels}, action_hz {hz:g}"
+    rate = "null" if hz is None else f"{hz:g}"
+    return f"views {', '.join(views)}, action {kind}, {channels}, action_hz {rate}"
 
 
 def _instruction_of(trained: Sequence[str], robot: EnvironmentRobot) -> str:

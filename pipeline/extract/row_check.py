@@ -31,8 +31,8 @@ from pipeline.vlm.slots import slot_deviations, tolerance_of
 class Deviation:
     """How far a row that was computed again is from the stored one.
 
-    `relative` is the largest deviation of all variants and slots, as a share of the root mean
-    square of the stored slot; `slot` is the index of that slot, counted over variants and slots.
+    `relative` is the largest of `slot_deviations` of all variants and slots; `slot` is the index of
+    that slot, counted over variants and slots.
     `same_pixels` says whether the frames and prompt still give the stored key. `where` names the
     recording and the row.
     """
@@ -63,8 +63,8 @@ class Reextraction:
 
     @property
     def beyond(self) -> list[Deviation]:
-        """Rows beyond the tolerance, and those with a NaN."""
-        return [row for row in self.deviations if not row.relative <= self.tolerance]
+        """Rows beyond the tolerance; a NaN is infinitely far."""
+        return [row for row in self.deviations if row.relative > self.tolerance]
 
     def lines(self) -> list[str]:
         """The result in lines for people."""

@@ -32,6 +32,8 @@ FeedMaker = Callable[
 Watch = Callable[[Actions, Actions, NDArray[np.bool_]], None]
 """Called with all chunks (sample, tick, horizon, action_dim) of a batch, the recorded chunks and
 their valid steps."""
+Alter = Callable[[Batch], Batch]
+"""Returns the batch that the policy sees; does not change its argument."""
 _SEED = 0
 _CHUNKS_AT_ONCE = 1024
 """The most chunks sampled in one forward pass, to bound the memory; but at least one a tick."""
@@ -73,7 +75,7 @@ def predict(
     feed: FeedMaker | None = None,
     watch: Watch | None = None,
     lags: Lags = NO_LAGS,
-    alter: Callable[[Batch], Batch] | None = None,
+    alter: Alter | None = None,
 ) -> Predictions:
     """The policy's chunks at these ticks, in evaluation mode, beside the recorded chunks.
 
@@ -83,8 +85,8 @@ def predict(
     figures; another `batch_size` changes those of a stochastic policy. Runs on the policy's device,
     on the batches of `feed`, by default the store's. Streams are `lags` late, and the policy sees
     what `alter` makes of a batch. `watch` is called with all samples. `progress` shows a bar on a
-    terminal. Raises `NumericsError`, naming episode, tick and time, where a
-    prediction or a recorded action is NaN or infinite.
+    terminal. Raises `NumericsError`, naming episode, tick and time, where a prediction or a
+    recorded action is NaN or infinite.
     """
     device = next(policy.parameters()).device
     # On the CPU, so that every device gets the same noise.
@@ -104,19 +106,7 @@ def predict(
             predicted.append(chunks[0])
             recorded.append(batch.action.cpu().numpy().copy())
             valid.append(batch.action_valid.cpu().numpy().astype(bool))
-            own = at[:, None] + np.arange(recorded[-1].shape[1])
-            steps, flat = own.ravel(), (own.size, recorded[-1].shape[2])
-            check_finite(
-                store,
-                "tick",
-                steps,
-                "recorded action",
-                recorded[-1].reshape(flat),
-                valid[-1].ravel(),
-            )
-            made_at = np.repeat(at, own.shape[1])
-            for chunk in chunks:
-                check_finite(store, "tick", made_at, "action of the policy", chunk.reshape(flat))
+            _check_finite(store, at, recorded[-1], valid[-1], chunks)
             if len(chunks) > 1:
                 sampled.append(np.abs(chunks - recorded[-1]).mean(axis=0))
             if watch is not None:
@@ -143,3 +133,19 @@ def _sample(
         for done in range(0, samples, at_once)
     ]
     return np.concatenate(parts)
+
+
+def _check_finite(
+    store: FeatureStore,
+    ticks: Ticks,
+    recorded: Actions,
+    valid: NDArray[np.bool_],
+    chunks: Float[np.ndarray, "sample tick horizon action_dim"],
+) -> None:
+    """A recorded action has a tick of its own; a prediction has the tick it was made at."""
+    own = ticks[:, None] + np.arange(recorded.shape[1])
+    steps = recorded.reshape(own.size, -1)
+    check_finite(store, "tick", own.ravel(), "recorded action", steps, valid.ravel())
+    made_at = np.repeat(ticks, recorded.shape[1])
+    for chunk in chunks:
+        check_finite(store, "tick", made_at, "action of the policy", chunk.reshape(steps.shape))

@@ -1,4 +1,4 @@
-"""The normalisation, fitted on the training ticks alone."""
+"""The normalisation, fitted on the training ticks alone; where a value is not finite."""
 
 from collections.abc import Generator, Iterable, Iterator, Sequence
 from contextlib import contextmanager

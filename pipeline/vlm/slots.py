@@ -146,7 +146,7 @@ def slot_deviations(
     It is relative to the stored number, or to the root mean square of the slot without its largest
     tenth where that is more: a few channels hundreds of times larger than the others, as large
     models have, neither hide a fault in these nor are one by their own rounding. Infinite where
-    features are not finite.
+    features are not finite, and where a slot of zeros is no longer zero.
     """
     numbers = stored.astype(np.float64)
     apart = np.maximum(np.abs(today.astype(np.float64) - numbers) - code, 0.0)
@@ -155,4 +155,4 @@ def slot_deviations(
     size = np.maximum(most, np.sqrt(np.mean(usual**2, axis=-1, keepdims=True)))
     with np.errstate(divide="ignore", invalid="ignore"):
         relative = np.where(apart == 0, 0.0, apart / size)  # a slot of zeros has no deviation
-    return np.nan_to_num(relative.max(axis=-1), nan=np.inf)
+    return np.nan_to_num(relative.max(axis=-1), nan=np.inf, posinf=np.inf)

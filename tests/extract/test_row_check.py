@@ -77,11 +77,13 @@ class TestDeviations:
         assert "VL row 11" in str(beyond)
         assert not again(document, tolerance=0.2).beyond
 
-    def test_a_nan_is_beyond_every_tolerance(self, document):
-        put(Path(document["extract"]["store"]), "vl/features", 3, np.nan)
+    @pytest.mark.parametrize("value", [np.nan, np.inf, 0.0], ids=["nan", "infinite", "zeros"])
+    def test_no_number_and_a_slot_of_zeros_are_beyond_every_tolerance(self, document, value):
+        put(Path(document["extract"]["store"]), "vl/features", 3, value)
         found = again(document, tolerance=1e3)
         assert [one.row for one in found.beyond] == [3]
         assert found.deviations[0].row == 3
+        assert found.deviations[0].relative == np.inf
 
     def test_other_pixels_are_named_as_such(self, document, monkeypatch):
         opened = Image.Image.convert
