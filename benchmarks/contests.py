@@ -26,23 +26,14 @@ def row_race(
 ) -> tuple[Race, Race]:
     """256 random VL rows: the fast ways, then the slow ones beside the store again."""
     folder.mkdir()
-    count, mapped = sizes["rows"], store.gatherer.tensor("features")
-    ram = mapped.clone()
-    drawn = draws(sizes["draws"], count, 0, len(mapped))
-    out = torch.zeros((count, *mapped.shape[1:]), dtype=mapped.dtype)
-    batch = store.gatherer.empty_batch(count, 1, 1, 1).touch()
-
-    def ours(rows: Index) -> None:
-        store.gatherer.copy(Selection({"features": rows}, {}), batch)
-
+    count, (ram, out, drawn, ways) = sizes["rows"], row_ways(store, sizes)
     fast: dict[str, Work] = {
         "memcpy": each(drawn, lambda rows: out.copy_(ram[rows[0] % (len(ram) - count) :][:count])),
-        **ceilings(ram, out, drawn),
-        OURS: each(drawn, ours),
-        OURS_2: two_threads(each(drawn, ours)),
+        **ways,
+        OURS_2: two_threads(ways[OURS]),
     }
     values = store.array("vl/features")
-    few = draws(sizes["draws"], count, 0, min(sizes["files"], len(mapped)))
+    few = draws(sizes["draws"], count, 0, min(sizes["files"], len(ram)))
     files = file_readers(folder / "files", values[: sizes["files"]])
     readers = row_readers(folder, store.path, "vl/features", values)
     fast |= {name: each(drawn, readers.pop(name)) for name in ("numpy memmap, fancy index",)}
@@ -57,6 +48,15 @@ def row_race(
 
 def slot_race(store: FeatureStore, sizes: Mapping[str, Any], rounds: int) -> Race:
     """Random VL rows of a store, against C gathers of the same bytes from RAM."""
+    *_, drawn, ways = row_ways(store, sizes)
+    warm(store)
+    return race(ways, rounds, least_s=sizes["least_s"], before=all_drawn(ways, len(drawn)))
+
+
+def row_ways(
+    store: FeatureStore, sizes: Mapping[str, Any]
+) -> tuple[Tensor, Tensor, list[Index], dict[str, Work]]:
+    """A copy of all rows in RAM, a buffer, random draws, and the ways to gather them."""
     count, mapped = sizes["rows"], store.gatherer.tensor("features")
     drawn = draws(sizes["draws"], count, 0, len(mapped))
     ram, out = mapped.clone(), torch.zeros((count, *mapped.shape[1:]), dtype=mapped.dtype)
@@ -65,9 +65,7 @@ def slot_race(store: FeatureStore, sizes: Mapping[str, Any], rounds: int) -> Rac
     def ours(rows: Index) -> None:
         store.gatherer.copy(Selection({"features": rows}, {}), batch)
 
-    fast = ceilings(ram, out, drawn) | {OURS: each(drawn, ours)}
-    warm(store)
-    return race(fast, rounds, least_s=sizes["least_s"], before=all_drawn(fast, len(drawn)))
+    return ram, out, drawn, ceilings(ram, out, drawn) | {OURS: each(drawn, ours)}
 
 
 def window_race(
