@@ -32,9 +32,8 @@ class Deviation:
     """How far a row that was computed again is from the stored one.
 
     `relative` is the largest of `slot_deviations` of all variants and slots; `slot` is the index of
-    that slot, counted over variants and slots.
-    `same_pixels` says whether the frames and prompt still give the stored key. `where` names the
-    recording and the row.
+    that slot, counted over variants and slots. `same_pixels` says whether the frames and prompt
+    still give the stored key. `where` names the recording and the row.
     """
 
     row: int
@@ -74,8 +73,8 @@ class Reextraction:
             return ["no row can be computed again", *unchecked]
         other = [str(row) for row in self.deviations if not row.same_pixels]
         return [
-            f"computed {len(self.deviations)} rows again, {self.tolerance:.0e} of a slot's root "
-            f"mean square is tolerated; the largest deviation: {self.deviations[0]}",
+            f"computed {len(self.deviations)} rows again, {self.tolerance:.0e} of a slot's size is "
+            f"tolerated; the largest deviation: {self.deviations[0]}",
             *capped(other, "rows of other pixels than the store's"),
             *(f"environment, {line}" for line in self.environment),
             *unchecked,
